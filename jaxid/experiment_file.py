@@ -1,169 +1,233 @@
-"""Text of an experiment file: its tables and keys, and whether its files are there.
+"""Text of an experiment file: tables, keys and values, and whether its files are there.
 
 What is wrong with them is said before the methods are loaded, which takes seconds: this
-module imports neither them nor JAX. `experiment/` reads the values.
+module imports neither them nor JAX. `experiment/` makes objects of the values.
 """
 
-import difflib
 import tomllib
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
+from typing import Annotated, Any, Literal
+
+import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.experiment_values import (
+    Bounds,
+    Column,
+    Corner,
+    Count,
+    Finite,
+    Fraction,
+    Magnitude,
+    PerJoint,
+    Positive,
+    Positives,
+    Times,
+    TomlTable,
+    Units,
+    Vector,
+    check_names,
+    decode_table,
+)
 from jaxid.measurement.log_columns import Selection, Selections
 from jaxid.measurement.text_format import TEXT_SUFFIXES, TextColumns
 from jaxid.robot.xml_files import read_xml
+from jaxid.units import Unit
 
-TomlTable = dict[str, Any]
-"""Table of a TOML file, or arguments that are made of one."""
-LOAD = ("mass", "centre_of_mass", "inertia", "body")
-INERTIA = ("xx", "yy", "zz", "xy", "xz", "yz")
-KEYS: dict[str, tuple[str, ...]] = {
-    "robot": (
-        "urdf",
-        "mjcf",
-        "tip",
-        "base",
-        "xacro_arguments",
-        "builtin",
-        "name",
-        "gravity",
-        "base_rotation",
-        "base_position",
-        "snap_tolerance",
-        "tool",
-    ),
-    "robot.tool": LOAD,
-    "robot.tool.inertia": INERTIA,
-    "load": LOAD,
-    "load.inertia": INERTIA,
-    "limits": (
-        "angle_unit",
-        "position_min",
-        "position_max",
-        "velocity",
-        "acceleration",
-        "jerk",
-        "force",
-    ),
-    "drives": ("gear_ratios", "matrix", "zero", "angle_unit", "max_torques"),
-    "model": (
-        "principal_axes",
-        "viscous",
-        "load",
-        "motor_ripple",
-        "joint_ripple",
-        "rotor_inertia",
-        "offset",
-        "coulomb",
-        "square_root",
-        "springs",
-    ),
-    "model.coulomb": ("epsilon", "hard", "asymmetric", "presliding", "stribeck"),
-    "recording": (
-        "angles",
-        "forces",
-        "velocities",
-        "time",
-        "sample_time",
-        "time_unit",
-        "angle_unit",
-        "velocity_unit",
-        "force_unit",
-        "torque_constants",
-        "rated_angles",
-        "rated_velocities",
-        "rated_forces",
-        "angle_signs",
-        "force_signs",
-        "angle_offsets",
-        "force_gains",
-        "unwrap",
-        "side",
-        "forces_side",
-        "forces_file",
-        "velocities_file",
-        "commands",
-        "lerobot_calibration",
-        "force_delay",
-        "largest_gap",
-        "bad_rows",
-        "start",
-        "stop",
-    ),
-    "filter": (
-        "kind",
-        "cutoff",
-        "order",
-        "force_cutoff",
-        "margin",
-        "window",
-        "velocity",
-        "acceleration",
-        "period",
-        "harmonics",
-    ),
-    "rows": ("step", "factors", "min_speed"),
-    "estimator": (
-        "kind",
-        "weights",
-        "ridge",
-        "uncertainty",
-        "pull",
-        "mass_max",
-        "radius",
-        "mass_min",
-        "centre_min",
-        "centre_max",
-        "total_mass",
-    ),
-    "rollout": (
-        "bodies",
-        "stiffness",
-        "damping",
-        "feed_forward",
-        "alike",
-        "contacts",
-        "samples",
-        "horizon",
-    ),
-    "excitation": (
-        "criterion",
-        "harmonics",
-        "omega",
-        "rest",
-        "spline",
-        "leads",
-        "samples",
-        "noise",
-        "starts",
-        "generations",
-        "time",
-        "seed",
-        "sample_time",
-        "controller",
-        "ros",
-        "nominal",
-        "force_margin",
-        "tip_speed",
-        "tip_acceleration",
-        "workspace",
-    ),
-    "excitation.spline": ("points", "duration"),
-    "excitation.leads": ("time", "periods"),
-    "collision": (
-        "distance",
-        "fit",
-        "packages",
-        "floor",
-        "capsules",
-        "boxes",
-        "pairs",
-    ),
+ANGLE_UNIT = Literal["rad", "deg"]
+SIDE = Literal["joint", "motor"]
+INERTIA = {
+    "xx": Magnitude,
+    "yy": Magnitude,
+    "zz": Magnitude,
+    "xy": float,
+    "xz": float,
+    "yz": float,
 }
-"""Names of the keys of each table; tests compare them with the arguments of TABLES."""
+LOAD = {"mass": Positive, "centre_of_mass": Vector, "inertia": INERTIA, "body": str}
+DRY_FRICTION = {
+    "epsilon": Positives,
+    "hard": bool,
+    "asymmetric": bool,
+    "presliding": bool,
+    "stribeck": Positives,
+}
+SPLINE = {"points": int, "duration": np.ndarray}
+LEADS = {"time": Positive, "periods": Annotated[int, Bounds(minimum=1, maximum=1000)]}
+CAPSULE = {
+    "name": str,
+    "body": str,
+    "start": Vector,
+    "radius": Positive,
+    "end": Vector,
+}
+BOX = {"name": str, "centre": Vector, "size": Vector, "rotation": Vector}
+KEYS: dict[str, TomlTable] = {
+    "robot": {
+        "urdf": str,
+        "mjcf": str,
+        "tip": str,
+        "base": str,
+        "xacro_arguments": dict[str, str | bool | int | float],
+        "builtin": Literal[
+            "tx90l_on_rail",
+            "tx40",
+            "ur10",
+            "ur10e",
+            "panda",
+            "iiwa14",
+            "kr300",
+            "planar_arm",
+        ],
+        "name": str,
+        "gravity": Vector,
+        "base_rotation": Vector,
+        "base_position": Vector,
+        "snap_tolerance": Magnitude,
+        "tool": LOAD,
+    },
+    "load": LOAD,
+    "limits": {
+        "angle_unit": ANGLE_UNIT,
+        "position_min": PerJoint,
+        "position_max": PerJoint,
+        "velocity": PerJoint,
+        "acceleration": PerJoint,
+        "jerk": PerJoint,
+        "force": PerJoint,
+    },
+    "drives": {
+        "gear_ratios": list[Finite],
+        "matrix": list[PerJoint],
+        "zero": list[Finite],
+        "angle_unit": ANGLE_UNIT,
+        "max_torques": list[Positive],
+    },
+    "model": {
+        "principal_axes": bool,
+        "viscous": bool | Literal["asymmetric"],
+        "load": bool,
+        "motor_ripple": tuple[Count, ...],
+        "joint_ripple": tuple[Count, ...],
+        "rotor_inertia": bool,
+        "offset": bool,
+        "coulomb": (bool, DRY_FRICTION),
+        "square_root": bool,
+        "springs": bool,
+    },
+    "recording": {
+        "angles": Column,
+        "forces": Column,
+        "velocities": Column,
+        "time": str | int | tuple[str | int, str | int],
+        "sample_time": float,
+        "time_unit": Unit,
+        "angle_unit": Units,
+        "velocity_unit": Units,
+        "force_unit": Units,
+        "torque_constants": PerJoint,
+        "rated_angles": PerJoint,
+        "rated_velocities": PerJoint,
+        "rated_forces": PerJoint,
+        "angle_signs": PerJoint,
+        "force_signs": PerJoint,
+        "angle_offsets": PerJoint,
+        "force_gains": PerJoint,
+        "unwrap": bool,
+        "side": SIDE,
+        "forces_side": SIDE,
+        "forces_file": str,
+        "velocities_file": str,
+        "commands": Column,
+        "lerobot_calibration": str,
+        "force_delay": float,
+        "largest_gap": Annotated[float, Bounds(above=1.0)],
+        "bad_rows": Annotated[float, Bounds(minimum=0.0, below=1.0)],
+        "start": float,
+        "stop": float,
+    },
+    "filter": {
+        "kind": Literal["butterworth", "savitzky_golay", "paper", "periodic"],
+        "cutoff": float | list[float],
+        "order": int,
+        "force_cutoff": float,
+        "margin": float,
+        "window": float,
+        "velocity": float,
+        "acceleration": float,
+        "period": float,
+        "harmonics": int,
+    },
+    "rows": {
+        "step": Count,
+        "factors": list[Count],
+        "min_speed": Magnitude | list[Magnitude],
+    },
+    "estimator": {
+        "kind": Literal["weighted", "least_squares", "huber", "tukey", "consistent"],
+        "weights": Literal["maximum_forces", "residual_variances"],
+        "ridge": Fraction | Literal["cross_validated"],
+        "uncertainty": Literal["spectral", "jackknife", "independent"],
+        "pull": Magnitude,
+        "mass_max": np.ndarray,
+        "radius": np.ndarray,
+        "mass_min": np.ndarray,
+        "centre_min": np.ndarray,
+        "centre_max": np.ndarray,
+        "total_mass": float,
+    },
+    "rollout": {
+        "bodies": bool,
+        "stiffness": Positive | PerJoint,
+        "damping": Positive | PerJoint,
+        "feed_forward": Positive | PerJoint,
+        "alike": list[list[str]],
+        "contacts": list[Times] | dict[str, list[Times]],
+        "samples": Annotated[int, Bounds(minimum=0, maximum=10_000)],
+        "horizon": Positive,
+    },
+    "excitation": {
+        "criterion": Literal[
+            "condition_number",
+            "weighted_condition_number",
+            "scaled_condition_number",
+            "d_optimal",
+            "a_optimal",
+            "e_optimal",
+        ],
+        "harmonics": Annotated[int, Bounds(minimum=1, maximum=50)],
+        "omega": Annotated[float, Bounds(above=0.0, maximum=1000.0)],
+        "rest": bool,
+        "spline": SPLINE,
+        "leads": (bool, LEADS),
+        "samples": Annotated[int, Bounds(minimum=2, maximum=10_000_000)],
+        "noise": list[Annotated[float, Bounds(above=0.0, below=1e9)]],
+        "starts": Count,
+        "generations": Annotated[int, Bounds(minimum=0, maximum=10_000)],
+        "time": Positive,
+        "seed": Annotated[int, Bounds(minimum=0, maximum=2**32 - 1)],
+        "sample_time": Annotated[float, Bounds(minimum=1e-5)],
+        "controller": Literal["franka", "kuka_fri", "kuka_rsi", "universal_robots"],
+        "ros": Literal["yaml", "mcap"],
+        "nominal": str,
+        "force_margin": Annotated[float, Bounds(minimum=0.0, below=1.0)],
+        "tip_speed": Positive,
+        "tip_acceleration": Positive,
+        "workspace": tuple[Corner, Corner],
+    },
+    "collision": {
+        "distance": Positive,
+        "fit": bool,
+        "packages": str,
+        "floor": Finite | Literal["base"] | bool,
+        "capsules": [CAPSULE],
+        "boxes": [BOX],
+        "pairs": list[tuple[str, str]],
+    },
+}
+"""Keys of each table, and what their values may be, as `decode_value` takes it."""
 FORMER_KEYS = {
     ("model", "coulomb", "dead_zone"): 0.0,
     ("rollout", "friction"): True,
@@ -195,7 +259,7 @@ def read_experiment_text(path: Path) -> str:
 
 
 def parse_tables(text: str, path: Path) -> TomlTable:
-    """Return the tables of an experiment file, whose names and keys are known."""
+    """Return the tables of an experiment file, with values of the declared types."""
     try:
         tables = tomllib.loads(text)
     except (ValueError, RecursionError) as error:
@@ -206,7 +270,10 @@ def parse_tables(text: str, path: Path) -> TomlTable:
     _drop_former_keys(tables)
     try:
         _require_tables(tables)
-        _require_known_keys(tables)
+        tables = {
+            name: decode_table(table, KEYS[name], name)
+            for name, table in tables.items()
+        }
         with within("robot"):
             _require_robot(tables["robot"], path.parent)
     except InputError as error:
@@ -232,7 +299,7 @@ def _table_at(tables: TomlTable, places: Iterable[str]) -> Any:
 
 def _require_tables(tables: TomlTable) -> None:
     """Reject tables that are unknown, no tables, or missing."""
-    check_names(tables, [name for name in KEYS if "." not in name])
+    check_names(tables, KEYS)
     for name, table in tables.items():
         if not isinstance(table, dict):
             raise InputError(f"`{name}` must be a table, but is {table!r}.")
@@ -240,14 +307,6 @@ def _require_tables(tables: TomlTable) -> None:
         raise InputError(
             "the table `[robot]` is missing: give it `urdf`, `mjcf` or `builtin`."
         )
-
-
-def _require_known_keys(tables: TomlTable) -> None:
-    """Reject keys that no table of this name has."""
-    for name, keys in KEYS.items():
-        table = _table_at(tables, name.split("."))
-        if isinstance(table, dict):
-            check_names(table, keys, name)
 
 
 def _require_robot(table: TomlTable, folder: Path) -> None:
@@ -304,27 +363,6 @@ def _select_columns(recording: TomlTable) -> Selections:
         if are_names and "{name}" not in str(value):
             selections[channel] = columns if isinstance(value, list) else columns[0]
     return selections
-
-
-def check_names(
-    table: TomlTable, known_names: Iterable[str], place: str = "the file"
-) -> None:
-    """Reject a key of a table, or a table of the file, that is not known."""
-    known_names = list(known_names)
-    for name in table:
-        if name in known_names:
-            continue
-        is_file = place == "the file"
-        path = name if is_file else f"{place}.{name}"
-        similar_names = difflib.get_close_matches(name, known_names, n=1, cutoff=0.6)
-        if similar_names:
-            raise InputError(
-                f"`{path}` is not a known key: did you mean `{similar_names[0]}`?"
-            )
-        owner = place if is_file else f"the table `[{place}]`"
-        raise InputError(
-            f"`{path}` is not a known key: {owner} has {', '.join(known_names)}."
-        )
 
 
 @contextmanager

@@ -161,6 +161,11 @@ QUICKLY = [
     "inspect column.toml a.csv",
     "identify experiment.toml a.csv --verify empty.csv",
     "excite inner.toml",
+    "inspect kind.toml",
+    "inspect unit.toml",
+    "excite range.toml",
+    "excite family.toml",
+    "excite list.toml",
     "payload lost.toml a.csv --loaded b.csv",
     "init none.urdf",
     "init broken.urdf",
@@ -179,6 +184,11 @@ def test_refusals_come_before_jax_is_loaded(folder):  # noqa: F811
         "key": EXPERIMENT.replace("cutoff", "cut_off"),
         "column": EXPERIMENT.replace("tau{}", "torque{}"),
         "inner": EXPERIMENT + "[model]\ncoulomb = { epsilom = 1 }",
+        "kind": EXPERIMENT.replace("cutoff = ", "cutoff = true # "),
+        "unit": EXPERIMENT.replace("[recording]", "[recording]\nangle_unit = 'grad'"),
+        "range": EXPERIMENT + "[excitation]\nstarts = 0",
+        "family": EXPERIMENT + "[excitation]\ncriterion = 'f_optimal'",
+        "list": EXPERIMENT + "[collision]\nboxes = [{ name = 1 }]",
         "broken": EXPERIMENT.replace('builtin = "planar_arm"', 'urdf = "broken.urdf"'),
         "lost": EXPERIMENT.replace('builtin = "planar_arm"', 'urdf = "lost.urdf"'),
     }
@@ -199,7 +209,14 @@ def test_refusals_come_before_jax_is_loaded(folder):  # noqa: F811
     assert found == ends, done.stderr
 
 
-HEAVY = {"scipy.signal", "scipy.stats", "optimistix", "plotly", "matplotlib"}
+HEAVY = {
+    "scipy.signal",
+    "scipy.spatial",
+    "scipy.stats",
+    "optimistix",
+    "plotly",
+    "matplotlib",
+}
 """Parts of the package's libraries that an `inspect` without logs does not need."""
 
 

@@ -23,12 +23,9 @@ import pytest
 import jaxid as jid
 from jaxid.cli import app as cli
 from jaxid.dynamics.sample_methods import in_numpy
-from jaxid.experiment.decoder import decode
-from jaxid.experiment.experiment import TABLES
-from jaxid.experiment.setup_tables import SIDES
-from jaxid.experiment_file import check_names
+from jaxid.experiment_file import KEYS
+from jaxid.experiment_values import decode_table
 from jaxid.identification.determination import OPEN_SHARES
-from jaxid.measurement.filters import FILTERS
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation.judgement import ERRORS, MAX_CONDITION_NUMBER
 from jaxid.validation.mistake_search import (
@@ -226,17 +223,8 @@ def test_python_in_a_page_runs(page, given, monkeypatch):
 @pytest.mark.parametrize("page", _with("toml"))
 def test_keys_in_a_page_exist(page):
     for block in _blocks(page, "toml"):
-        content = tomllib.loads(block)
-        check_names(content, list(TABLES))
-        for name, table in content.items():
-            functions = TABLES[name]
-            if name == "filter":
-                functions = [FILTERS[table.pop("kind", "butterworth")]]
-                if "cutoff" in table:
-                    table["cutoff"] = np.max(table["cutoff"]).item()
-            if name == "robot":
-                table = {"builtin": "panda", **table} if "tool" in table else table
-            decode(functions, table, name, complete=False, skip=SIDES)
+        for name, table in tomllib.loads(block).items():
+            decode_table(table, KEYS[name], name)
 
 
 def test_other_packages_bodies_become_ours(given):

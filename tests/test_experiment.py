@@ -4,6 +4,7 @@ import dataclasses
 import json
 import re
 import tomllib
+import typing
 
 import equinox as eqx
 import numpy as np
@@ -12,14 +13,18 @@ import pytest
 import jaxid as jid
 from jaxid import units
 from jaxid.errors import InputError
-from jaxid.experiment.decoder import decode, keys_of, table_of
+from jaxid.excitation.criteria import CRITERIA
+from jaxid.experiment.decoder import keys_of, table_of
 from jaxid.experiment.experiment import TABLES, load_experiment
-from jaxid.experiment.robot_tables import known_load
-from jaxid.experiment.setup_tables import SIDES
+from jaxid.experiment.setup_tables import KINDS, SIDES
 from jaxid.experiment.template import write_template
-from jaxid.experiment_file import KEYS, check_names
+from jaxid.experiment_file import KEYS
+from jaxid.experiment_values import decode_table
+from jaxid.identification.uncertainty import UNCERTAINTIES
 from jaxid.io import union_members
 from jaxid.measurement.columns import Columns, with_lerobot_calibration
+from jaxid.measurement.filters import FILTERS
+from jaxid.trajectory.controllers import CONTROLLERS
 from jaxid.workflow import log_loading
 from jaxid.workflow.log_loading import load_log, load_logs, read_log
 
@@ -583,24 +588,27 @@ def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
             re.sub(rf"^# ({key} = )", r"\1", others, count=1, flags=re.M)
         )
         for name, table in content.items():
-            functions = TABLES[name]
-            if name == "filter":
-                # The keys of other kinds follow their kind, which stays a comment.
-                functions = [f for f in functions if key in keys_of(f)] or functions[:1]
-                table = {key: table[key]} if key in table else {}
-            # An inner table has keys without default, which stay comments.
-            check_names(table.pop("tool", {}), list(keys_of(known_load)))
-            decode(functions, table, name, complete=False, skip=SIDES)
+            decode_table(table, KEYS[name], name)
 
 
 def keys_by_table(name, functions):
-    """The names of a table's keys, and of the tables within it."""
+    """The names of the arguments of functions, and of the functions of inner tables."""
     keys = [key for function in functions for key in keys_of(function).values()]
     found = {name: {key.name for key in keys}}
     for key in keys:
-        for function in filter(None, map(table_of, union_members(key.hint))):
-            if function is not type(None):
-                found |= keys_by_table(f"{name}.{key.name}", [function])
+        options = [*union_members(key.hint), *typing.get_args(key.hint)[:1]]
+        for function in filter(None, map(table_of, options)):
+            found |= keys_by_table(f"{name}.{key.name}", [function])
+    return found
+
+
+def declared_keys(name, hints):
+    """The names of the keys that a table declares, and of those of inner tables."""
+    found = {name: set(hints)}
+    for key, hint in hints.items():
+        for option in hint if isinstance(hint, tuple | list) else [hint]:
+            if isinstance(option, dict):
+                found |= declared_keys(f"{name}.{key}", option)
     return found
 
 
@@ -610,7 +618,24 @@ def test_the_keys_that_are_known_before_jax_is_loaded_are_those_of_the_objects()
         expected |= keys_by_table(name, functions)
     expected["recording"] -= set(SIDES)
     expected["filter"] |= {"kind"}
-    assert {name: set(keys) for name, keys in KEYS.items()} == expected
+    declared = {}
+    for name, hints in KEYS.items():
+        declared |= declared_keys(name, hints)
+    assert declared == expected
+
+
+@pytest.mark.parametrize(
+    ("table", "key", "family"),
+    [
+        ("filter", "kind", FILTERS),
+        ("estimator", "kind", KINDS),
+        ("estimator", "uncertainty", UNCERTAINTIES),
+        ("excitation", "criterion", CRITERIA),
+        ("excitation", "controller", CONTROLLERS),
+    ],
+)
+def test_names_that_a_key_may_have_are_those_of_the_family(table, key, family):
+    assert set(typing.get_args(KEYS[table][key])) == set(family)
 
 
 TX40 = """\

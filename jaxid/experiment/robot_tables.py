@@ -9,14 +9,13 @@ from typing import Annotated, Any, Literal, cast
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.experiment_file import TomlTable
+from jaxid.experiment_values import PerJoint, TomlTable, Vector
 from jaxid.measurement.columns import Columns
 from jaxid.robot import library
 from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
 from jaxid.robot.robot import Robot, Tool
 from jaxid.robot.rotations import rpy_rotation
 from jaxid.robot.shapes import HalfSpace
-from jaxid.workflow.allowed_values import Finite, Magnitude, PerJoint, Positive, Vector
 from jaxid.workflow.robot_file import RobotFile, joint_number
 
 MIN_FORCE = 1e-9
@@ -26,9 +25,9 @@ AngleUnit = Literal["rad", "deg"]
 
 def inertia_tensor(
     *,
-    xx: Magnitude,
-    yy: Magnitude,
-    zz: Magnitude,
+    xx: float,
+    yy: float,
+    zz: float,
     xy: float = 0.0,
     xz: float = 0.0,
     yz: float = 0.0,
@@ -48,7 +47,7 @@ def inertia_tensor(
 
 def known_load(
     *,
-    mass: Positive,
+    mass: float,
     centre_of_mass: Vector | None = None,
     inertia: Annotated[np.ndarray, inertia_tensor] | None = None,
     body: str | None = None,
@@ -122,25 +121,13 @@ class RobotSource:
     tip: str | None = None
     base: str | None = None
     xacro_arguments: dict[str, str | bool | int | float] | None = None
-    builtin: (
-        Literal[
-            "tx90l_on_rail",
-            "tx40",
-            "ur10",
-            "ur10e",
-            "panda",
-            "iiwa14",
-            "kr300",
-            "planar_arm",
-        ]
-        | None
-    ) = None
+    builtin: str | None = None
 
     name: str | None = None
     gravity: Vector | None = None
     base_rotation: Vector | None = None
     base_position: Vector | None = None
-    snap_tolerance: Magnitude | None = None
+    snap_tolerance: float | None = None
     tool: Annotated[Callable[[Robot], Tool | float], known_load] | None = None
 
     def robot_file(self, folder: Path) -> RobotFile | None:
@@ -306,11 +293,11 @@ def _angle_scale(robot: Robot, unit: AngleUnit) -> np.ndarray:
 def replace_drives(
     robot: Robot,
     *,
-    gear_ratios: list[Finite] | None = None,
+    gear_ratios: list[float] | None = None,
     matrix: list[PerJoint] | None = None,
-    zero: list[Finite] | None = None,
+    zero: list[float] | None = None,
     angle_unit: AngleUnit = "rad",
-    max_torques: list[Positive] | None = None,
+    max_torques: list[float] | None = None,
 ) -> Robot:
     """Motors and gears, needed for logs on the motors' side.
 

@@ -6,7 +6,7 @@ They say how logs become parameters: a `Setup` is built from them.
 import dataclasses
 import inspect
 from pathlib import Path
-from typing import Annotated, Any, Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
@@ -14,7 +14,8 @@ from jaxid.arrays import Float, Texts
 from jaxid.dynamics import terms
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
-from jaxid.experiment_file import TomlTable, within
+from jaxid.experiment_file import KEYS, within
+from jaxid.experiment_values import TomlTable, decode_value, quoted
 from jaxid.identification import estimators
 from jaxid.identification.consistency import BodyBounds
 from jaxid.identification.estimators_by_name import ESTIMATORS
@@ -25,17 +26,10 @@ from jaxid.measurement.columns import Columns, with_lerobot_calibration
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 from jaxid.units import Unit
-from jaxid.workflow.allowed_values import (
-    Count,
-    Fraction,
-    Magnitude,
-    OneOf,
-    Positive,
-)
 from jaxid.workflow.robot_file import RobotFile
 from jaxid.workflow.setup import LogReading, Setup, pull_to_bodies
 
-from .decoder import call, decode, decode_value, keys_of, quoted
+from .decoder import call, decode, keys_of
 
 MAX_SPEED = 100.0
 """Speed that no joint exceeds [rad/s or m/s]."""
@@ -61,11 +55,11 @@ class DryFriction:
             like `0.1`; or a list.
     """
 
-    epsilon: Positive | list[Positive] | None = None
+    epsilon: float | list[float] | None = None
     hard: bool = False
     asymmetric: bool = False
     presliding: bool = False
-    stribeck: Positive | list[Positive] | None = None
+    stribeck: float | list[float] | None = None
 
     def transition(self, robot: Robot) -> terms.AbstractTransition:
         """Return the transition between the directions."""
@@ -146,8 +140,8 @@ class AbstractEffects:
     principal_axes: bool = False
     viscous: bool | Literal["asymmetric"] = True
     load: bool = False
-    motor_ripple: tuple[Count, ...] = ()
-    joint_ripple: tuple[Count, ...] = ()
+    motor_ripple: tuple[int, ...] = ()
+    joint_ripple: tuple[int, ...] = ()
     rotor_inertia: bool = True
     offset: bool | None = None
     coulomb: bool | DryFriction | None = None
@@ -282,8 +276,7 @@ def require_fitting_units(columns: Columns, robot: Robot, arguments: TomlTable) 
 
 def build_filters(table: TomlTable) -> list[filters.AbstractFilter]:
     """Return the filter, or several to choose from."""
-    hint = Annotated[str, OneOf(filters.FILTERS)]
-    kind = decode_value(table.get("kind", ""), hint, "filter.kind")
+    kind = decode_value(table.get("kind", ""), KEYS["filter"]["kind"], "filter.kind")
     build = filters.FILTERS[kind]
     keys = {name: value for name, value in table.items() if name != "kind"}
     usual_cutoffs = list(USUAL_CUTOFFS) if kind == "butterworth" else None
@@ -299,9 +292,9 @@ def build_filters(table: TomlTable) -> list[filters.AbstractFilter]:
 def build_rows(
     robot: Robot,
     *,
-    step: Count | None = None,
-    factors: list[Count] | None = None,
-    min_speed: Magnitude | list[Magnitude] | None = None,
+    step: int | None = None,
+    factors: list[int] | None = None,
+    min_speed: float | list[float] | None = None,
 ) -> tuple[filters.AbstractDecimation, Float[np.ndarray, " joints"] | None]:
     """Rows of the least-squares problem, and samples that become rows.
 
@@ -388,11 +381,11 @@ def build_estimation(
     robot_file: RobotFile | None,
     bounds: TomlTable,
     *,
-    kind: Annotated[str, OneOf(KINDS)] = "consistent",
+    kind: str = "consistent",
     weights: Literal["maximum_forces", "residual_variances"] | None = None,
-    ridge: Fraction | Literal["cross_validated"] | None = None,
-    uncertainty: Annotated[str, OneOf(UNCERTAINTIES)] = "spectral",
-    pull: Magnitude | None = None,
+    ridge: float | Literal["cross_validated"] | None = None,
+    uncertainty: str = "spectral",
+    pull: float | None = None,
 ) -> Estimation:
     """Estimator of the parameters from the rows, and of their standard deviations.
 

@@ -32,7 +32,7 @@ def skew(a: Vector3) -> Matrix3:
     return namespace(a).array(rows)
 
 
-def rotation_about(axis: Vector3, angle: Numbers) -> Rotations:
+def rotation_about(axis: Vector3, angle: AnyArray) -> Rotations:
     """Return the rotation about a unit vector by an angle [rad].
 
     The part of a vector along the axis stays and the rest turns: in this form a
@@ -48,12 +48,13 @@ def rotation_about(axis: Vector3, angle: Numbers) -> Rotations:
 
 def axis_rotation(axis: Numbers, angle: float) -> Matrix3:
     """Return the rotation about a unit vector [rad], exact for quarter turns."""
-    return without_rounding(rotation_about(np.asarray(axis, np.float64), angle))
+    vector = np.asarray(axis, np.float64)
+    return without_rounding(rotation_about(vector, np.asarray(angle)))
 
 
 def rpy_rotation(rpy: Numbers) -> Matrix3:
     """Return the rotation by roll, pitch and yaw [rad] about x, y, z, as in URDF."""
-    roll, pitch, yaw = map(axis_rotation, np.eye(3), rpy)
+    roll, pitch, yaw = map(axis_rotation, np.eye(3), np.asarray(rpy))
     return without_rounding(yaw @ pitch @ roll)
 
 

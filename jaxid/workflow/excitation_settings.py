@@ -2,7 +2,7 @@
 
 import dataclasses
 import math
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -13,8 +13,6 @@ from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.lead_in_and_out import LeadsBasis
 from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
-
-from .allowed_values import Bounds, Count, OneOf, Positive
 
 Corner = tuple[float, float, float]
 
@@ -28,8 +26,8 @@ class Leads:
         periods: Number of periods between them.
     """
 
-    time: Positive | None = None
-    periods: Annotated[int, Bounds(minimum=1, maximum=1000)] = 1
+    time: float | None = None
+    periods: int = 1
 
 
 @dataclasses.dataclass(frozen=True)
@@ -62,7 +60,7 @@ class Excitation:
         ros: Kind of the file for ROS 2: "yaml" or "mcap" (a bag).
         nominal: Folder of an earlier result of `jaxid identify`, whose parameters tell
             the forces, like `"report"`.
-        force_margin: Fraction of the largest forces to keep free, by nominal
+        force_margin: float of the largest forces to keep free, by nominal
             parameters, like `0.1`; by default 0.3 if friction or others are unknown,
             else 0.
         tip_speed: Largest speed of the end-effector [m/s], like `1.5`.
@@ -71,25 +69,25 @@ class Excitation:
             `[[-1.0, -1.0, 0.1], [1.0, 1.0, 1.5]]`.
     """
 
-    criterion: Annotated[str, OneOf(CRITERIA)] = "d_optimal"
-    harmonics: Annotated[int, Bounds(minimum=1, maximum=50)] = 5
-    omega: Annotated[float, Bounds(above=0.0, maximum=1000.0)] = 0.8
+    criterion: str = "d_optimal"
+    harmonics: int = 5
+    omega: float = 0.8
     rest: bool = False
     spline: RestToRestSplineBasis | None = None
     leads: bool | Leads = True
-    samples: Annotated[int, Bounds(minimum=2, maximum=10_000_000)] = 800
-    noise: list[Annotated[float, Bounds(above=0.0, below=1e9)]] | None = None
-    starts: Count = 32
-    generations: Annotated[int, Bounds(minimum=0, maximum=10_000)] = 12
-    time: Positive | None = None
-    seed: Annotated[int, Bounds(minimum=0, maximum=2**32 - 1)] = 0
-    sample_time: Annotated[float, Bounds(minimum=1e-5)] | None = None
-    controller: Annotated[str, OneOf(CONTROLLERS)] | None = None
+    samples: int = 800
+    noise: list[float] | None = None
+    starts: int = 32
+    generations: int = 12
+    time: float | None = None
+    seed: int = 0
+    sample_time: float | None = None
+    controller: str | None = None
     ros: Literal["yaml", "mcap"] = "yaml"
     nominal: str | None = None
-    force_margin: Annotated[float, Bounds(minimum=0.0, below=1.0)] | None = None
-    tip_speed: Positive = math.inf
-    tip_acceleration: Positive = math.inf
+    force_margin: float | None = None
+    tip_speed: float = math.inf
+    tip_acceleration: float = math.inf
     workspace: tuple[Corner, Corner] | None = None
 
     @property

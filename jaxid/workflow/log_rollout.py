@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import RigidBodies
@@ -12,7 +12,6 @@ from jaxid.measurement.columns import Columns
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import Remark, Status
 
-from .allowed_values import Bounds, Positive
 from .log_identification import require_separate_logs
 from .log_loading import load_logs, read_commands, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
@@ -48,12 +47,12 @@ class ServoSettings:
     """
 
     bodies: bool | None = None
-    stiffness: Positive | list[float] | None = None
-    damping: Positive | list[float] | None = None
-    feed_forward: Positive | list[float] | None = None
+    stiffness: float | list[float] | None = None
+    damping: float | list[float] | None = None
+    feed_forward: float | list[float] | None = None
     alike: list[list[str]] | None = None
     contacts: list[Span] | dict[str, list[Span]] | None = None
-    samples: Annotated[int, Bounds(minimum=0, maximum=10_000)] = 0
+    samples: int = 0
 
 
 @dataclasses.dataclass(frozen=True)
@@ -64,7 +63,7 @@ class TorqueSettings:
         horizon: With torques: length of the windows that are simulated [s].
     """
 
-    horizon: Positive = 0.2
+    horizon: float = 0.2
 
 
 def identify_rollout_from_logs(

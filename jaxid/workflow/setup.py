@@ -4,7 +4,7 @@ import dataclasses
 import functools
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -54,7 +54,6 @@ from jaxid.measurement.recording import Recording
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
 
-from .allowed_values import Bounds
 from .robot_file import RobotFile
 
 MAX_LOAD_FRICTION_FITS = 10
@@ -107,7 +106,7 @@ class LogReading:
         force_delay: Time by which forces stand later in the log than angles [s].
         largest_gap: Longest pause that is bridged, in sample times; a tenth of the
             period of the filter's cut-off frequency is bridged in any case.
-        bad_rows: Fraction of the rows that may be bad, and are left out.
+        bad_rows: float of the rows that may be bad, and are left out.
         start: Start of the part of every log that is used [s], like `0.0`.
         stop: End of that part [s], like `10.0`.
     """
@@ -117,8 +116,8 @@ class LogReading:
     commands: Selection | None = None
     lerobot_calibration: str | None = None
     force_delay: float = 0.0
-    largest_gap: Annotated[float, Bounds(above=1.0)] = 1.75
-    bad_rows: Annotated[float, Bounds(minimum=0.0, below=1.0)] = MAX_BAD_ROWS
+    largest_gap: float = 1.75
+    bad_rows: float = MAX_BAD_ROWS
     start: float = -np.inf
     stop: float = np.inf
 

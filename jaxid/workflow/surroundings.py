@@ -15,12 +15,13 @@ from jaxid.robot.limits_and_drives import owners
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
 
-from .allowed_values import Finite, Positive, Vector
 from .robot_file import RobotFile, joint_number
+
+Vector = tuple[float, float, float]
 
 
 def capsule(
-    *, name: str, body: str, start: Vector, radius: Positive, end: Vector | None = None
+    *, name: str, body: str, start: Vector, radius: float, end: Vector | None = None
 ) -> tuple[str, Capsule]:
     """Return a capsule and the name of its body; a sphere without `end`.
 
@@ -69,10 +70,10 @@ class Collision:
             the joints can bring together.
     """
 
-    distance: Positive = 0.03
+    distance: float = 0.03
     fit: bool = True
     packages: str | None = None
-    floor: Finite | Literal["base"] | bool = "base"
+    floor: float | Literal["base"] | bool = "base"
     capsules: tuple[Annotated[tuple[str, Capsule], capsule], ...] = ()
     boxes: tuple[Annotated[Box, box], ...] = ()
     pairs: list[tuple[str, str]] | None = None
