@@ -69,7 +69,7 @@ class BatchFit(eqx.Module):
 class DataSets(NamedTuple):
     """Data sets of a batch, or one of them.
 
-    Forces have an axis of draws before the samples. The mask is one for rows that
+    Forces may have axes of draws before the samples. The mask is one for rows that
     count, and None if all count; `numbers` are those of the geometry [datasets,
     numbers], if robots differ.
     """
@@ -90,6 +90,9 @@ def solve(
     With the time between two rows [s], standard deviations come from the spectral
     sandwich.
     """
+    sets, *draws, samples, joints = batch.forces.shape
+    forces = jnp.reshape(batch.forces, (sets, -1, samples, joints))
+    batch = batch._replace(forces=forces)
     leaves, tree = jax.tree.flatten(jax.tree.map(jnp.asarray, batch))
 
     def solve_leaves(on_cpu: bool, *leaves: Array) -> BatchFit:
@@ -103,7 +106,11 @@ def solve(
             default=functools.partial(solve_leaves, False),
         )
 
-    return divided(solve_on_any)(*leaves)
+    def with_axes_of_draws(x):
+        return x if x.ndim == 1 else x.reshape(sets, *draws, x.shape[-1])
+
+    fit = divided(solve_on_any)(*leaves)
+    return jax.tree.map(with_axes_of_draws, fit)
 
 
 def _solve_groups(

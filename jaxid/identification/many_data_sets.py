@@ -18,6 +18,7 @@ from jaxid.arrays import (
     Float,
     in_parts,
     is_traced,
+    namespace,
     on_cores,
     require_float64,
 )
@@ -37,6 +38,8 @@ from .uncertainty import IndependentRows
 
 Robots = Sequence[Robot] | None
 """Robot of each data set; None for that of the base parameters."""
+Place = tuple[int, ...]
+"""Number of a data set, and of a draw of its forces if there are several."""
 
 
 def identify_batch(
@@ -88,19 +91,16 @@ def identify_batch(
                 "`weights` must be given where JAX is tracing the robot's limits."
             )
         weights = 1.0 / np.asarray(robot.max_forces)
-    sets = len(forces)
-    draws = forces.shape[1:-2]
+    # Each operation on arrays of JAX would be sent to the device by itself.
+    weights_shape = (len(forces), robot.joints)
     batch = DataSets(
         motion=motion,
-        forces=jnp.asarray(forces).reshape(sets, -1, *forces.shape[-2:]),
-        weights=jnp.broadcast_to(jnp.asarray(weights), (sets, robot.joints)),
-        mask=None if mask is None else jnp.asarray(mask, float),
+        forces=forces,
+        weights=namespace(weights).broadcast_to(weights, weights_shape),
+        mask=None if mask is None else mask.astype(float),
         numbers=None,
     )
-    fit = _solve_together(base, robots, batch, row_time)
-    return jax.tree.map(
-        lambda x: x if x.ndim == 1 else x.reshape(sets, *draws, x.shape[-1]), fit
-    )
+    return _solve_together(base, robots, batch, row_time)
 
 
 def _check_arguments(base, motion, forces, mask, robots) -> None:
@@ -151,7 +151,10 @@ def _solve_together(
         data_sets = batch._replace(numbers=numbers)
     if robot.tool is not None:
         tool_forces = base.model.tool_forces(batch.motion)
-        data_sets = data_sets._replace(forces=batch.forces - tool_forces[:, None])
+        sets, *draws, samples, joints = batch.forces.shape
+        shape = (sets, *(1,) * len(draws), samples, joints)
+        remaining_forces = batch.forces - tool_forces.reshape(shape)
+        data_sets = data_sets._replace(forces=remaining_forces)
     if is_traced(data_sets):
         return solve(regressor, data_sets, row_time)
     fit = in_parts(lambda part: solve(regressor, part, row_time), data_sets)
@@ -166,33 +169,37 @@ def _solve_again(
     row_time: float | None,
 ) -> BatchFit:
     """Solve data sets that are not well conditioned by `identify`, on all cores."""
+    numbers = np.flatnonzero(~np.asarray(fit.determined))
+    if not len(numbers):
+        # Nothing else leaves the device.
+        return fit
     fit = jax.tree.map(np.array, fit)
     counts = np.full(len(fit.determined), batch.motion.q[0].size)
     if batch.mask is not None:
         counts = np.sum(batch.mask, axis=(1, 2))
-    numbers = np.flatnonzero(~fit.determined)
     # Data sets that determine too little have no estimate, and no condition number.
     fit.parameters[numbers] = 0.0
     fit.condition_numbers[numbers] = np.inf
     fit.standard_deviations[numbers] = np.inf
     fit.naive_standard_deviations[numbers] = np.inf
 
-    def identify_one(place: tuple[int, int]) -> Fit:
-        k, draw = place
+    def identify_one(place: Place) -> Fit:
+        k, *_ = place
         robot = base.model.robot if robots is None else robots[k]
         placed_base = eqx.tree_at(lambda b: b.model.robot, base, robot)
-        return _identify_one(placed_base, batch, k, draw, row_time)
+        return _identify_one(placed_base, batch, place, row_time)
 
-    draws = batch.forces.shape[1]
+    draws = np.ndindex(batch.forces.shape[1:-2])
     sufficient_sets = numbers[counts[numbers] > base.size].tolist()
-    places = list(itertools.product(sufficient_sets, range(draws)))
-    for (k, draw), result in zip(places, on_cores(identify_one, places), strict=True):
-        fit.parameters[k, draw] = result.parameters
-        fit.standard_deviations[k, draw] = result.standard_deviations
-        fit.residual_rms[k, draw] = result.residual_rms
-        fit.naive_standard_deviations[k, draw] = result.naive_standard_deviations
-        fit.dof[k, draw] = result.uncertainty.dof
+    places = [(k, *draw) for k, draw in itertools.product(sufficient_sets, draws)]
+    for place, result in zip(places, on_cores(identify_one, places), strict=True):
+        fit.parameters[place] = result.parameters
+        fit.standard_deviations[place] = result.standard_deviations
+        fit.residual_rms[place] = result.residual_rms
+        fit.naive_standard_deviations[place] = result.naive_standard_deviations
+        fit.dof[place] = result.uncertainty.dof
         # Whether a data set determines its parameters does not depend on the draw.
+        k, *_ = place
         fit.determined[k] = np.isfinite(result.naive_standard_deviations).all()
         if fit.determined[k]:
             fit.condition_numbers[k] = result.condition_numbers.scaled
@@ -200,10 +207,11 @@ def _solve_again(
 
 
 def _identify_one(
-    base: BaseParameters, batch: DataSets, k: int, draw: int, row_time: float | None
+    base: BaseParameters, batch: DataSets, place: Place, row_time: float | None
 ) -> Fit:
     """Return the fit of one draw of a data set."""
-    motion, forces = jax.tree.map(np.asarray, (batch.motion[k], batch.forces[k, draw]))
+    k, *_ = place
+    motion, forces = jax.tree.map(np.asarray, (batch.motion[k], batch.forces[place]))
     mask = np.ones(forces.shape, bool)
     if batch.mask is not None:
         mask = np.asarray(batch.mask[k]) > 0

@@ -11,7 +11,8 @@ from virtual import left_out_in_turn, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.arrays import in_parts
-from jaxid.identification.batch_solution import MAX_CONDITION
+from jaxid.identification import many_data_sets
+from jaxid.identification.batch_solution import MAX_CONDITION, BatchFit
 from jaxid.identification.factors import Blocks
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.many_data_sets import identify_batch
@@ -88,6 +89,30 @@ def test_a_gpu_takes_all_data_sets_from_where_they_are(monkeypatch):
     assert given is x
 
 
+def test_only_the_mark_of_good_data_sets_leaves_a_gpu(base, arrays, monkeypatch):
+    """Without `jit`, too: estimates stay there, and nothing is computed one by one."""
+    device_arrays = jax.tree.map(jnp.asarray, arrays)
+    inputs = []
+
+    class OnGpu:
+        ndim = 2
+
+        def __array__(self, *_, **__):
+            pytest.fail("an array of the GPU was copied")
+
+    def solve(_, data_sets):
+        inputs.append(data_sets)
+        marks = jnp.ones(3, bool)
+        estimates = [OnGpu() for _ in range(6)]
+        return BatchFit(*estimates[:4], marks, *estimates[4:])
+
+    monkeypatch.setattr(many_data_sets, "in_parts", solve)
+    fit = identify_batch(base, *device_arrays)
+    assert isinstance(fit.parameters, OnGpu)
+    assert inputs[0].motion is device_arrays[0]
+    assert inputs[0].forces is device_arrays[1]
+
+
 def test_honest_deviations_of_many_draws(base, sets, arrays):
     """The compiled sandwich is that of one identification after the other."""
     mask = np.ones((3, SAMPLES, 2), bool)
@@ -141,6 +166,15 @@ def test_data_sets_that_determine_too_little_are_marked_and_solved_like_alone(
     known = np.isfinite(one.naive_standard_deviations)
     assert 0 < known.sum() < base.size
     np.testing.assert_array_equal(np.isfinite(fit.standard_deviations[1]), known)
+    motion, forces = stacked(weak)
+    draws = identify_batch(base, motion, np.stack([forces, forces], axis=1))
+    for draw in range(2):
+        np.testing.assert_allclose(
+            draws.parameters[:, draw], fit.parameters, rtol=1e-9, atol=1e-12
+        )
+        np.testing.assert_allclose(
+            draws.standard_deviations[:, draw], fit.standard_deviations, rtol=1e-9
+        )
     honest = identify_batch(base, *stacked(weak), row_time=sets[0].sample_time)
     np.testing.assert_allclose(
         honest.standard_deviations[1], one.standard_deviations, rtol=1e-6
