@@ -35,13 +35,11 @@ MIN_FALL = 1e-3
 """Fall of the errors' mean logarithm that continues the refinement."""
 MAX_ROUNDS = 8
 """Largest number of rounds of the refinement."""
-TIME_STEP = 0.01
-"""Longest step in which commands are compared [s]."""
 CHOICE_ROUNDS = 2
 """Rounds after which held and interpolated commands are compared."""
 MAX_STEP_ERROR = 0.05
 """Median change of estimates, in their deviations, above which steps are halved."""
-MAX_HALVINGS = 2
+MAX_HALVINGS = 3
 """Largest number of times that steps are halved."""
 FIT_COUNT = 15
 """Number of fits, for the progress."""
@@ -124,12 +122,11 @@ def identify_rollout(
         count += 1
 
     # Choices show in long steps, too.
-    search_step = float(motion.sample_time.max())
-    simulator = ServoSimulator(motion, search_step, bodies=bodies)
+    simulator = ServoSimulator(motion, float(motion.sample_time.max()), bodies=bodies)
     choice = EffectChoice.start(simulator, groups, known_compliance, advance)
     linear_parameters = _linear_baseline(choice.fit)
     # Held commands that count as interpolated ones would imitate a feed-forward.
-    fine_fit, _ = _with_better_commands(choice.with_effects(("f",)), search_step)
+    fine_fit, _ = _with_better_commands(choice.with_effects(("f",)))
     if fine_fit.simulator.hold:
         held_simulator = dataclasses.replace(simulator, hold=True)
         held_fit = _with_simulator(choice.fit, held_simulator, choice.fit.parameters)
@@ -142,7 +139,7 @@ def identify_rollout(
 
     if progress is not None:
         progress("refining", 0.0)
-    fit, hold_is_told = _with_better_commands(fit, TIME_STEP)
+    fit, hold_is_told = _with_better_commands(fit)
     fit = without_imitations(fit, groups)
     undetermined = undetermined_effects(fit)
     # An effect that is zero is none.
@@ -150,8 +147,7 @@ def identify_rollout(
     fit = _descend(without_effects(fit, undetermined))
     fine_fit = _in_short_enough_steps(fit)
     if fine_fit is not fit:
-        fine_step = fine_fit.simulator.time_step
-        fit, hold_is_told = _with_better_commands(fine_fit, fine_step)
+        fit, hold_is_told = _with_better_commands(fine_fit)
     heavy_joints = choice.loaded_joints & (known_compliance > 0.0)
     return ServoFit.of(
         fit,
@@ -209,12 +205,6 @@ def _with_better_bodies(fit: JointFit, bodies: Bodies) -> JointFit:
     return trial.weighed_by_errors() if is_better else fit
 
 
-def _in_steps(fit: JointFit, time_step: float) -> JointFit:
-    """Return the fit with other steps, along the loads of measured positions."""
-    simulator = dataclasses.replace(fit.simulator, time_step=time_step, path=None)
-    return _with_simulator(fit, simulator, fit.parameters)
-
-
 def _with_simulator(
     fit: JointFit, simulator: ServoSimulator, parameters: JointParameters
 ) -> JointFit:
@@ -229,13 +219,12 @@ def _with_simulator(
     )
 
 
-def _with_better_commands(fit: JointFit, time_step: float) -> tuple[JointFit, bool]:
-    """Return the fit in short steps, with held or interpolated commands.
+def _with_better_commands(fit: JointFit) -> tuple[JointFit, bool]:
+    """Return the fit with held or interpolated commands.
 
     Returns:
         The better fit, and whether the logs tell it.
     """
-    fit = _in_steps(fit, time_step)
     simulator = fit.simulator
     half_sample = 0.5 * float(simulator.motion.sample_time.mean())
     # Held commands are half a sample late.
