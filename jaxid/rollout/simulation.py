@@ -258,18 +258,6 @@ def _sensitivities(
     return r.T, jnp.moveaxis(S, 2, 0)
 
 
-@functools.partial(jax.jit, static_argnums=3)
-def _moments(
-    unknowns: Array, channels: Channels, hold: AnyArray, steps: int
-) -> Moments:
-    r, S = _sensitivities(unknowns, channels, hold, steps)
-    return Moments(
-        jnp.sum(r**2, axis=-1),
-        jnp.einsum("cut,ct->cu", S, r),
-        jnp.einsum("cut,cvt->cuv", S, S),
-    )
-
-
 @dataclasses.dataclass(frozen=True)
 class ServoSimulator:
     """Motions, and how they are simulated.
@@ -343,8 +331,10 @@ class ServoSimulator:
             theta: Parameters of each joint, or of each motion and joint.
             start: Initial states [motions, joints, states].
         """
-        moments = self._call(_moments, theta, start)
-        return Moments(*(self._by_motion(x) for x in moments))
+        r, S = self.sensitivities(theta, start)
+        cost = np.sum(r**2, axis=-1)
+        gradient = (S @ r[..., None])[..., 0]
+        return Moments(cost, gradient, S @ S.swapaxes(-1, -2))
 
     def sensitivities(
         self, theta: np.ndarray, start: np.ndarray
