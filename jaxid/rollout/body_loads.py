@@ -28,7 +28,7 @@ class Bodies:
     coupled: bool = False
 
     def loads(
-        self, paths: np.ndarray, step_times: np.ndarray
+        self, paths: np.ndarray, velocities: np.ndarray, step_times: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the torques between two points of paths, and inertias of the joints.
 
@@ -37,6 +37,7 @@ class Bodies:
 
         Args:
             paths: Positions [motions, joints, points].
+            velocities: Their velocities.
             step_times: Time between two points of each motion [s].
 
         Returns:
@@ -44,8 +45,8 @@ class Bodies:
             points - 1].
         """
         motion_loads = [
-            self._path_loads(path.T, float(dt))
-            for path, dt in zip(paths, step_times, strict=True)
+            self._path_loads(path.T, velocity.T, float(dt))
+            for path, velocity, dt in zip(paths, velocities, step_times, strict=True)
         ]
         torques, inertias = (np.stack(x) for x in zip(*motion_loads, strict=True))
         return torques, inertias
@@ -58,9 +59,16 @@ class Bodies:
             _filter_positions(x, float(dt))
             for x, dt in zip(positions, sample_times, strict=True)
         ]
-        return self.loads(np.stack(smooth_positions), sample_times)
+        paths = np.stack(smooth_positions)
+        velocities = [
+            np.gradient(path, float(dt), axis=-1)
+            for path, dt in zip(paths, sample_times, strict=True)
+        ]
+        return self.loads(paths, np.stack(velocities), sample_times)
 
-    def _path_loads(self, path: np.ndarray, dt: float) -> tuple[np.ndarray, np.ndarray]:
+    def _path_loads(
+        self, path: np.ndarray, velocity: np.ndarray, dt: float
+    ) -> tuple[np.ndarray, np.ndarray]:
         """Return torques and inertias [joints, points - 1] of one path."""
         q = 0.5 * (path[1:] + path[:-1])
         zeros = np.zeros_like(q)
@@ -73,9 +81,8 @@ class Bodies:
             return gravity.T, zeros.T
 
         qd = np.diff(path, axis=0) / dt
-        acceleration = np.zeros_like(path)
-        acceleration[1:-1] = np.diff(path, n=2, axis=0) / dt**2
-        qdd = 0.5 * (acceleration[1:] + acceleration[:-1])
+        # Not of positions: their second differences smear the jumps of accelerations.
+        qdd = np.diff(velocity, axis=0) / dt
         M = in_numpy(model, model.inertia, q, shared=(parameters,))
         inertias = np.diagonal(M, axis1=1, axis2=2)
         torques = in_numpy(model, model.forces, q, qd, qdd, shared=(parameters,))

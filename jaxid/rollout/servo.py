@@ -104,8 +104,25 @@ class StageInputs(NamedTuple):
     ahead: AnyArray
 
 
+def is_held_until_jump(state: State, theta: Array, inputs: StageInputs) -> Array:
+    """Return whether dry friction holds a joint at rest until its command jumps.
+
+    Args:
+        state: State before the step.
+        theta: Parameters, in the order of `PARAMETERS`.
+        inputs: Inputs of the first stage.
+    """
+    _, _, _, b, a, F, mu, Fs, _, um, g, _, f = theta
+    feed_forward = f * g * inputs.command_rate
+    drive = g * inputs.first_command + b - state.q + state.integral + feed_forward
+    load = a * inputs.load
+    force = jnp.clip(drive, -um, um) - load
+    is_at_rest = (state.w == 0.0) & (jnp.abs(force) <= F + mu * jnp.abs(load) + Fs)
+    return is_at_rest & (inputs.first_command != inputs.second_command)
+
+
 def advance_stage(
-    state: State, theta: Array, inputs: StageInputs, h: AnyArray
+    state: State, theta: Array, inputs: StageInputs, is_held: Array, h: AnyArray
 ) -> State:
     """Return the state of a joint behind a stage.
 
@@ -113,6 +130,7 @@ def advance_stage(
         state: State before the stage.
         theta: Parameters, in the order of `PARAMETERS`.
         inputs: Inputs of the stage.
+        is_held: Whether dry friction holds the joint in the first part of the step.
         h: Time of a step [s].
     """
     J, B, _, b, a, F, mu, Fs, vs, um, g, ki, f = theta
@@ -122,17 +140,21 @@ def advance_stage(
     load = a * inputs.load
     integral_factor = 1.0 + ki * duration
     feed_forward = f * g * inputs.command_rate
+    second_share = 1.0 - inputs.first_share
+    # While dry friction holds a joint, it balances all other forces.
+    first_share = jnp.where(is_held, 0.0, inputs.first_share)
 
     def mean_of_parts(first: Array, second: Array) -> Array:
-        return second + inputs.first_share * (first - second)
+        return first_share * first + second_share * second
 
     def drive_of(command: Array) -> Array:
         return integral_factor * (g * command + b - q) + integral + feed_forward
 
     # A held command jumps within the step: the mean command would saturate otherwise.
     drives = drive_of(inputs.first_command), drive_of(inputs.second_command)
-    force = mean_of_parts(*(jnp.clip(drive, -um, um) for drive in drives)) - load
+    force = mean_of_parts(*(jnp.clip(drive, -um, um) - load for drive in drives))
     friction = F + mu * jnp.abs(load) + Fs * jnp.exp(-((w / vs) ** 2))
+    friction = mean_of_parts(friction, friction)
 
     # The position at the end of the stage counts in the error, unless it saturates.
     is_within = (jnp.where(jnp.abs(drive) < um, 1.0, 0.0) for drive in drives)
@@ -148,7 +170,8 @@ def advance_stage(
     # A joint that has stopped in the first stage starts the second one at rest.
     next_velocity = jnp.where(is_moving, w + inputs.ahead * (u - w), 0.0)
     step = inputs.share * h
-    command = mean_of_parts(inputs.first_command, inputs.second_command)
+    jump = inputs.first_command - inputs.second_command
+    command = inputs.second_command + inputs.first_share * jump
     error = g * command + b - q
     next_integral = integral + step * ki * (error - duration * u)
     return State(q + step * u, next_velocity, next_integral)

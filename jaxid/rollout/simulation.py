@@ -27,6 +27,7 @@ from .servo import (
     StageInputs,
     State,
     advance_stage,
+    is_held_until_jump,
 )
 
 MAX_ROUNDS = 12
@@ -214,14 +215,20 @@ def _path(
     def step(state: State, inputs: tuple[DelayedCommand, Array, Array]):
         commands, load, inertia = inputs
 
-        def advance(state: State, stage_inputs: tuple[DelayedCommand, Array, Array]):
+        def stage_of(stage_inputs: tuple[DelayedCommand, Array, Array]) -> StageInputs:
             command, share, ahead = stage_inputs
-            stage = StageInputs(*command.at(lateness, h), load, inertia, share, ahead)
-            return advance_stage(state, theta, stage, h), None
+            return StageInputs(*command.at(lateness, h), load, inertia, share, ahead)
 
-        # A loop: XLA would fuse two stages into one long expression, twice as slow.
+        def advance(state: State, stage_inputs: tuple[DelayedCommand, Array, Array]):
+            stage = stage_of(stage_inputs)
+            return advance_stage(state, theta, stage, is_held, h), None
+
         shares = jnp.array(SHARES), jnp.array(VELOCITY_FACTORS)
-        state, _ = jax.lax.scan(advance, state, (commands, *shares))
+        stages = commands, *shares
+        first_stage = stage_of(jax.tree.map(lambda x: x[0], stages))
+        is_held = is_held_until_jump(state, theta, first_stage)
+        # A loop: XLA would fuse two stages into one long expression, twice as slow.
+        state, _ = jax.lax.scan(advance, state, stages)
         return state, state
 
     inputs = stage_commands, channels.load, channels.inertia
@@ -267,15 +274,15 @@ class ServoSimulator:
         time_step: Longest step, 5 % more if that makes them fewer [s].
         hold: Whether commands are held until the next one, instead of interpolated.
         bodies: Bodies that load the joints; None without.
-        path: Positions at all steps whose loads act [motions, joints, steps]; those
-            that were measured if None.
+        path: States at all steps whose loads act [motions, joints, steps]; those of the
+            measured positions if None.
     """
 
     motion: ServoMotion
     time_step: float = 0.01
     hold: bool = False
     bodies: Bodies | None = None
-    path: Any = None
+    path: State | None = None
 
     @property
     def steps(self) -> int:
@@ -292,7 +299,8 @@ class ServoSimulator:
             zeros = np.zeros((motions, joints, (samples - 1) * self.steps))
             return zeros, zeros
         if self.path is not None:
-            return self.bodies.loads(self.path, motion.sample_time / self.steps)
+            step_times = motion.sample_time / self.steps
+            return self.bodies.loads(self.path.q, self.path.w, step_times)
         loads = self.bodies.measured_loads(motion.positions, motion.sample_time)
         torques, inertias = (np.repeat(x, self.steps, axis=-1) for x in loads)
         return torques, inertias
@@ -361,16 +369,20 @@ class ServoSimulator:
         """Return the simulator with the loads of its own simulation."""
         if self.bodies is None:
             return self
-        return dataclasses.replace(self, path=self.states(theta, start).q)
+        return dataclasses.replace(self, path=self.states(theta, start))
 
     def parts(self, places: Sequence[Place]) -> "ServoSimulator":
         """Return the simulator of parts of its motions, along the same loads."""
         path = None
         if self.path is not None:
             steps = self.steps
-            path = np.stack(
-                [self.path[k][:, a * steps : (b - 1) * steps + 1] for k, a, b in places]
-            )
+
+            def cut(x: np.ndarray) -> np.ndarray:
+                return np.stack(
+                    [x[k][:, a * steps : (b - 1) * steps + 1] for k, a, b in places]
+                )
+
+            path = State(*(cut(x) for x in self.path))
         return dataclasses.replace(self, motion=self.motion.parts(places), path=path)
 
     def in_agreement(self, theta: np.ndarray, start: np.ndarray) -> "ServoSimulator":
@@ -383,7 +395,7 @@ class ServoSimulator:
                 break
             if previous_path is None:
                 continue
-            change = np.abs(simulator.path - previous_path)
+            change = np.abs(simulator.path.q - previous_path.q)
             if np.nanmax(change, initial=0.0) < AGREEMENT:
                 break
         return simulator
