@@ -28,7 +28,7 @@ from .equal_joints import joint_groups, pull_equal_joints
 from .joint_fits import RESOLUTION, JointFit
 from .motion import Contacts, JointParameters, ServoMotion
 from .result import ServoFit
-from .servo import INDEX, LOWER
+from .servo import INDEX, LOWER, MAX_DELAY
 from .simulation import ServoSimulator
 
 MIN_FALL = 1e-3
@@ -231,7 +231,7 @@ def _with_better_commands(fit: JointFit) -> tuple[JointFit, bool]:
     change = half_sample if simulator.hold else -half_sample
     parameters = fit.parameters.copy()
     delays = parameters[:, INDEX["d"]] + change
-    parameters[:, INDEX["d"]] = np.maximum(delays, 0.0)
+    parameters[:, INDEX["d"]] = np.clip(delays, 0.0, MAX_DELAY)
     rival_simulator = dataclasses.replace(simulator, hold=not simulator.hold)
     rival = _with_simulator(fit, rival_simulator, parameters)
     rivals = [rival]
