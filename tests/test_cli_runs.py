@@ -146,6 +146,7 @@ def test_a_payload_is_found_and_can_be_subtracted(shop, run):  # noqa: F811
     assert "✓ The payload on joint3 has" in page
     assert "moment of inertia about x" in page
     assert "model without the payload" in page
+    assert "the payload as an aluminium ball of" in page
     assert " ".join(pasted(out, "[robot.tool]").split()) in page
     (shop / "tool.toml").write_text(SPATIAL + pasted(out, "[robot.tool]"))
     tool = load_experiment("tool.toml").setup.robot.tool

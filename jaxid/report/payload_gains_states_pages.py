@@ -12,6 +12,7 @@ from jaxid.identification.operating_states import StatesFit
 from jaxid.identification.parameter_changes import Verdict
 from jaxid.identification.payload import Payload
 from jaxid.result_table import percent, significant, with_deviation
+from jaxid.robot.collision_geometry import Shape
 from jaxid.robot.robot import Robot
 from jaxid.validation.torque_errors import TorqueErrors, relative_error
 
@@ -20,11 +21,14 @@ from .figure import Figure
 from .figure_elements import CYCLE, GREY, Curve, Panel
 from .forces_of_models import model_force_figure
 from .friction_and_gravity import friction_figure
+from .motion_figures import pose_figure, surface_points
 from .parameter_words import FRAMES_NOTE
 from .several_runs_report import Answer
 
 Errors = Sequence[TorqueErrors]
 """Torque errors on some logs."""
+BALL_MASS = 11_310.0
+"""Mass of an aluminium ball with a radius of 1 m [kg]."""
 
 
 def payload_answer(
@@ -53,6 +57,8 @@ def payload_answer(
             "model with the payload": loaded_errors,
         }
         figures.append(model_force_figure(predictions, robot, title))
+    if loaded and payload.mass > 0:
+        figures.insert(0, payload_figure(payload, robot, loaded[0]))
     return Answer(
         f"{robot.name}: payload",
         f"The payload on {joint} has a mass of {mass} ± {half_width} kg, and the model "
@@ -66,6 +72,20 @@ def payload_answer(
         f"The frame is that of the body that {joint} moves. A_c to F_c are about the "
         "centre of mass, along the axes of this frame.",
         tool_lines(payload, joint),
+    )
+
+
+def payload_figure(payload: Payload, robot: Robot, log: TorqueErrors) -> Figure:
+    """Return the robot along a log, with a ball of the payload's mass at its centre."""
+    radius = np.cbrt(payload.mass / BALL_MASS)
+    ball = surface_points(Shape(payload.centre_of_mass[None], radius))
+    return pose_figure(
+        robot,
+        log.positions,
+        time=log.time,
+        title=f"{log.name}: the payload as an aluminium ball of "
+        f"{significant(payload.mass)} kg",
+        clouds=[(payload.body, ball)],
     )
 
 
