@@ -416,7 +416,7 @@ def test_what_has_changed_between_two_runs_is_told(folder, first, run):
     assert run("compare", "warm", "first")[0] == 0, "an earlier comparison may go"
     shutil.copytree("first", "again")
     code, out, _ = run("compare", "first", "again")
-    assert "were made of one log, `a.csv`, or parts of it" in " ".join(out.split())
+    assert "were made of one log, `a.csv`, or of parts of it" in " ".join(out.split())
     assert refused(run("compare", "first", "first/"), "`first` is given twice")
     assert refused(run("compare", "first", "none"), "`none` does not exist")
 
@@ -438,7 +438,7 @@ def test_two_models_are_laid_over_one_log(folder, first, run):
         assert errors[name]["relative"] == pytest.approx(expected["relative"], rel=1e-9)
     page = (folder / "comparison" / "report.html").read_text(encoding="utf-8")
     assert "predicts a better than the other model" in page
-    assert "Both models over one log" in page
+    assert "Both models on one log" in page
     assert "parameters have changed" not in page
 
 
@@ -491,7 +491,7 @@ def test_errors_of_many_rows_are_of_every_nth(folder, first, words, monkeypatch)
     monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
     monkeypatch.setattr("jaxid.validation.torque_errors.MAX_ROWS", 100)
     said = words("identify", "experiment.toml", "a.csv", "-o", "long")
-    assert "torque errors and figures take one of every 3 of its 2" in said
+    assert "torque errors and figures use one of every 3 of its 2" in said
     short, long = (
         result(folder, n)["errors"]["identification"][0] for n in ("first", "long")
     )
@@ -507,7 +507,7 @@ def test_a_long_log_that_must_be_mended_is_read_as_a_whole(
     lines.insert(700, lines[700])
     (folder / "twins.csv").write_text("\n".join(lines))
     said = words("identify", "experiment.toml", "twins.csv")
-    assert "twins.csv is long, but was read as a whole: rows of" in said
+    assert "twins.csv is long, but had to be read as a whole: rows of" in said
     lines[900:903] = 3 * ["1,2,x,4,5"]
     (folder / "bad.csv").write_text("\n".join(lines))
     assert refused(run("identify", "experiment.toml", "bad.csv"), "bad.csv")

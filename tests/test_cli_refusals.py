@@ -21,7 +21,7 @@ from jaxid.cli.app import main
 KEYS = [
     ('"t"', '"t"\ntime_unit = "ns"', "has 2e+11 samples in a second: check"),
     ('"t"', '"t"\nforce_delay = 100', "but the longest segment of `a` lasts 6 s"),
-    ("cutoff = 10", "cutoff = 99", "take one of 1 samples at most"),
+    ("cutoff = 10", "cutoff = 99", "use a step of at most 1 samples"),
     ('"q{}"', '["q1"]', "for each joint"),
     ('"q{}"', '["q1", "tau1"]', "`tau1` of `a.csv` is used"),
     *(

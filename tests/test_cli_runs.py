@@ -290,7 +290,7 @@ def test_what_does_not_go_together(folder, first, run, table, command, said):  #
 def test_what_is_not_seen_or_not_used_is_said(folder, words):  # noqa: F811
     (folder / "huber.toml").write_text(EXPERIMENT + '[estimator]\nkind = "huber"\n')
     said = words("payload", "huber.toml", "a.csv", "--loaded", "b.csv", ends=3)
-    assert "all runs are weighted least squares here" in said
+    assert "this command always uses weighted least squares" in said
     assert "do not determine all ten parameters" in said
 
 
@@ -329,7 +329,7 @@ def test_a_model_is_chosen_and_its_file_identifies(shop, run):  # noqa: F811
     names = [type(term).__name__ for term in chosen.setup.model.terms]
     assert "LinearSpring" not in names
     page = Path("chosen.html").read_text(encoding="utf-8")
-    assert "way of the search" in page
+    assert "path of the search" in page
     assert "chosen model" in page
     assert run("identify", "chosen.toml", "empty.csv", "-o", "c")[0] in (0, 3)
     again = run("choose", "experiment.toml", "empty.csv")

@@ -290,13 +290,13 @@ def test_thresholds_are_those_of_the_code(question):
 
 def test_the_limits_of_mistakes_are_the_codes():
     page = (ROOT / "docs" / "is_my_fit_good.md").read_text(encoding="utf-8")
-    assert f"that it helps most and explains {GAINS.named:.1f}, both" in page
-    assert f"less than {GAINS.named_rest:g} of what it missed" in page
+    assert f"gains most and scores {GAINS.named:.1f} or more, both" in page
+    assert f"must be less than {GAINS.named_rest:g} of what it was" in page
     assert f"or less than {100 * MAX_CURED_MISFIT:g} % of the forces" in page
-    assert f"and less than {GAINS.possible_rest:g} of what it missed" in page
-    assert f"From {GAINS.possible:g} on it is marked" in page
-    assert f"that explains {GAINS.contact:g} is a contact" in page
-    assert f"if more than {100 * MAX_MISFIT:g} % of the forces are missed" in page
+    assert f"and less than {GAINS.possible_rest:g} of what it was" in page
+    assert f"With a score from {GAINS.possible:g} on it is marked" in page
+    assert f"a score of {GAINS.contact:g} is called a contact" in page
+    assert f"if the error is more than {100 * MAX_MISFIT:g} % of the forces" in page
 
 
 def _commands(page: Path) -> dict[str, str]:

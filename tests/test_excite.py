@@ -197,7 +197,7 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
     assert np.abs(qdd).max() <= 4
     assert t[-1] > 2 * np.pi / 0.8
     for said in (
-        "criteria, of which this motion was designed for",
+        "criteria; this motion was designed for",
         "expected standard deviations",
         "use of the limits",
         "follows the designed motion from",
@@ -404,7 +404,7 @@ def test_limits_forces_by_nominal_parameters(designed, run, no_pictures, monkeyp
     assert "use of the other limits" in out
     use = r"[45]\.\d+ N m +≤ 6 N m +[89]\d\.\d +12 less a margin of"
     assert re.search(rf"force of joint `hinge` +{use}", out)
-    assert "counted as zero in the forces: fv1" in " ".join(out.split())
+    assert "taken as zero in the forces: fv1" in " ".join(out.split())
     assert (
         "the robot starts at rest and follows the designed motion from 0.500 to" in out
     )

@@ -57,7 +57,7 @@ def test_coefficients_are_found(experiment, seed):
         k = fit.base.names.index(name)
         assert abs(fit.parameters[k] / value - 1) < 0.05
         assert abs(fit.parameters[k] - value) < 4 * fit.standard_deviations[k]
-    assert not any("has not settled" in note for note in fit.notes)
+    assert not any("has not converged" in note for note in fit.notes)
     # Both kinds of dry friction change their direction at the speed that is planted.
     *_, load_friction = fit.base.model.terms
     np.testing.assert_allclose(load_friction.transition.speed[1:], 0.04, rtol=0.15)

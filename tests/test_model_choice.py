@@ -87,7 +87,7 @@ def test_the_best_so_far_is_returned_when_time_is_up(experiment, tmp_path):
     choice = jid.experiment.choose_model(experiment, [log], seconds=0.0)
     assert not choice.is_complete
     assert choice.text == FILE
-    assert "time ended" in str(choice)
+    assert "time limit was reached" in str(choice)
 
 
 @pytest.mark.parametrize(

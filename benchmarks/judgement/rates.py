@@ -31,7 +31,7 @@ SPOILT_KINDS = "plain", "Stribeck", "heavy friction", "pauses", "load friction"
 """Kinds of logs that are spoilt, one machine after the other."""
 USUAL = (
     "NOT DETERMINED",
-    "cannot be told apart",
+    "cannot be distinguished",
     "physically consistent",
 )
 """Parts of sentences that tell how good a model is and what it determines."""

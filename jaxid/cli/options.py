@@ -30,7 +30,7 @@ OutputFolder = Annotated[
 ]
 Force = Annotated[
     bool,
-    typer.Option("--force", help="Write even where other files are there already."),
+    typer.Option("--force", help="Overwrite files that are there already."),
 ]
 Detail = Annotated[
     bool | None,
@@ -51,7 +51,7 @@ Seed = Annotated[
 Tip = Annotated[
     str | None,
     typer.Option(
-        metavar="LINK", help="The end-effector: take only the chain that leads to it."
+        metavar="LINK", help="The end-effector: use only the chain that leads to it."
     ),
 ]
 Base = Annotated[
@@ -79,7 +79,7 @@ Verified = Annotated[
     typer.Option(
         "--verify",
         metavar="LOG",
-        help="A log that the fit does not see; may be repeated.",
+        help="A log for validation only; may be repeated.",
     ),
 ]
 Loaded = Annotated[

@@ -65,8 +65,8 @@ def export(
     faults = read_faults(report)
     if faults and not force:
         raise InputError(
-            f"the verdict of `{report}` is that its model must not be used: "
-            f"{faults[0]} Correct that first, or write it anyway with `--force`."
+            f"by its verdict, the model of `{report}` must not be used: {faults[0]} "
+            "Correct that first, or write the file anyway with `--force`."
         )
     fit = read_fit(report)
     match to:
@@ -100,8 +100,8 @@ def show_omissions(
     )
     if names:
         text = (
-            f"`{path}` cannot hold {', '.join(names)}: a simulation with it lacks "
-            "these effects, which `--to c` and `--to json` keep."
+            f"`{path}` cannot hold {', '.join(names)}: a simulation with this file "
+            "lacks these effects; `--to c` and `--to json` keep them."
         )
         terminal.show_remarks(console, [Remark(text, Status.DOUBTFUL)])
 
@@ -135,17 +135,21 @@ def compare(
     first: Annotated[
         Path,
         typer.Argument(
-            help="Report of one run, like that of the cold robot.", metavar="FIRST"
+            help="Report of one run, such as that of the cold robot.", metavar="FIRST"
         ),
     ],
     second: Annotated[
         Path,
-        typer.Argument(help="Report of another run or model of it.", metavar="SECOND"),
+        typer.Argument(
+            help=("Report of another run, or of another model."), metavar="SECOND"
+        ),
     ],
     log: Annotated[
         Path | None,
         typer.Option(
-            "--log", metavar="LOG", help="A log that both models predict, side by side."
+            "--log",
+            metavar="LOG",
+            help=("A log on which to compare the predictions of both models."),
         ),
     ] = None,
     output: options.OutputFolder = Path("comparison"),

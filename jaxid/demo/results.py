@@ -163,7 +163,7 @@ def paper_table(study: Study) -> Table:
             rows.append((name, f"{paper[k]:.2f}", f"{estimate} ± {deviation}"))
     quantities, statements, results = zip(*rows, strict=True)
     return Table(
-        f"the paper, and the results on the virtual {base.model.robot.name}",
+        f"the paper, beside the results on the virtual {base.model.robot.name}",
         Column("quantity", quantities),
         Column("paper", statements),
         Column("here", results),
@@ -196,7 +196,7 @@ def demo_page(study: Study) -> str:
     """Return the page of the demo as HTML."""
     headline, *findings = remarks(study)
     notes = (
-        "six base parameters, cold and warm, are the paper's",
+        "six base parameters, cold and warm, have the values of the paper",
         *study.base.model.robot.notes,
         "assumed: the other parameters of bodies, rotors and friction, and all "
         "disturbances",
@@ -248,7 +248,7 @@ def _excitation(study: Study) -> Section:
         ),
         f"The motion is a Fourier series of {settings.HARMONICS} harmonics at "
         f"{settings.OMEGA:g} rad/s within all limits and clear of collisions. As in "
-        "the paper, it has the least condition number.",
+        "the paper, it minimises the condition number.",
         *designs,
         picture(
             speed_figure(robot, robot.limits, times, motion),
@@ -296,8 +296,9 @@ def _verification(study: Study) -> Section:
     groups = {"identification": [identification], "verification": [verification]}
     return "Verification on another path", [
         f"The path after ISO 9283 in a cube of {settings.EDGE:g} m, with rests at its "
-        f"corners, up to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². Of "
-        "all joint angles that reach a pose, those nearest to a posture are taken.",
+        f"corners, up to {settings.SPEED:g} m/s and {settings.ACCELERATION:g} m/s². "
+        "Where several joint angles reach a pose, those nearest to a given posture "
+        "are used.",
         picture(
             speed_figure(robot, robot.limits, times, path.motion(times)),
             "Fig. 8: path of the end-effector.",
@@ -311,8 +312,9 @@ def _verification(study: Study) -> Section:
             "Fig. 10: errors on both paths; the paper's measure is in the tables.",
         ),
         (error_table(study, 0), error_table(study, 1)),
-        "The torque of an axis at rest may be anything up to stiction, which no model "
-        "of speeds predicts: so even the true parameters leave errors there.",
+        "At rest, friction can take any value up to stiction. A model in which "
+        "friction depends on speed cannot predict it, so even the true parameters "
+        "leave errors there.",
     ]
 
 

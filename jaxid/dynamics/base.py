@@ -351,6 +351,6 @@ def _doubts(
         )
     if regrouped_columns.max_residual > MAX_UNEXPLAINED:
         yield (
-            "a dependent column is reproduced with an error of "
+            "the combination of columns that replaces a dependent one has an error of "
             f"{regrouped_columns.max_residual:.1e} of its size."
         )

@@ -39,7 +39,7 @@ class DesignStatus(enum.StrEnum):
     CONVERGED = "the last quarter of its steps hardly improved the motion"
     IMPROVING = "the last quarter of its steps still improved the motion"
     STOPPED = "stopped before its end"
-    GIVEN = "found by a solver that was given"
+    GIVEN = "found by a solver of your own"
 
 
 class Comparison(NamedTuple):
@@ -165,7 +165,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         """Return the table of criteria."""
         names, reference_values, values = zip(*self.criteria, strict=True)
         return Table(
-            f"criteria, of which this motion was designed for: {self.criterion.name}",
+            f"criteria; this motion was designed for: {self.criterion.name}",
             Column("criterion", names),
             Column("random motion", reference_values),
             Column("this motion", values),
@@ -190,7 +190,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         for kind, use in zip(kinds, self.use, strict=True):
             if (use > 0).any():
                 columns.append(Column(kind, 100 * use, "%", "{:.1f}".format))
-        return Table("use of the limits, for all times", *columns)
+        return Table("use of the limits, at all times", *columns)
 
     @property
     def remarks(self) -> list[Remark]:
@@ -201,9 +201,9 @@ class ExcitationPlan(Summarised, eqx.Module):
         )
         if gain < 1.0:
             text = (
-                f"Standard deviations are {1.0 / gain:.3g} times "
-                "those of a random motion, which keeps the limits "
-                "of the joints alone: search longer (`--resume`)"
+                f"Standard deviations are {1.0 / gain:.3g} times those of a random "
+                "motion that keeps the limits of the joints only: search longer "
+                "(`--resume`)"
             )
             remark = Remark(text, Status.DOUBTFUL)
         remarks = [remark]
@@ -212,7 +212,7 @@ class ExcitationPlan(Summarised, eqx.Module):
             text = f"This motion does not determine: {', '.join(self.undetermined)}"
             remarks.append(Remark(text, Status.BAD))
         if self.interrupted:
-            text = "The design was stopped before its end"
+            text = "The design was stopped early"
             remarks.append(Remark(text, Status.DOUBTFUL))
         if self.status is DesignStatus.IMPROVING:
             text = (

@@ -108,8 +108,7 @@ class ExcitationProblem:
         self.prior = zero_prior if prior is None else np.asarray(prior)
         if prior is not None and not self.criterion.weighted:
             raise InputError(
-                "`prior` needs a weighted criterion, "
-                f"but that is the {self.criterion.name}."
+                f"`prior` needs a weighted criterion, not the {self.criterion.name}."
             )
         if self.prior.shape != (base.size, base.size):
             raise InputError(

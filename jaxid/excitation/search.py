@@ -151,7 +151,7 @@ def search(
             )
 
     candidates = yield from _improve_finely(problem, candidates, deadline)
-    yield Step("keeping the limits closely", candidates)
+    yield Step("final stage on a finer grid", candidates)
 
 
 def _improve_finely(
@@ -162,7 +162,7 @@ def _improve_finely(
     if time.monotonic() >= deadline:
         order = order[:BATCH]
     for places in np.split(order, range(BATCH, len(order), BATCH)):
-        step = Step("keeping the limits closely", candidates)
+        step = Step("final stage on a finer grid", candidates)
         iterates = _begin(problem, FINE_SAMPLES, candidates.x[places])
         iterates = yield from _improve(
             problem,
@@ -224,7 +224,7 @@ def _improve_children(
     deadline: float,
 ) -> Search:
     """Improve one child of each motion; return the best of parents and children."""
-    step = Step("improving descendants", candidates)
+    step = Step("combining and improving motions", candidates)
     children = crossover(problem, np.asarray(candidates.x), random)
     motions = []
     for start in range(0, len(children), BATCH):

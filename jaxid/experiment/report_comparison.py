@@ -48,7 +48,8 @@ def compare_reports(
     except InputError as error:
         if log is None:
             raise InputError(
-                f"{error} Or add `--log`: a log that both predict."
+                f"{error} Or add `--log` with a log on which to compare their "
+                "predictions."
             ) from error
     doubts = data_doubts(results, fits, comparison, log)
     return ComparisonReport(first_fit.base.model.robot, comparison, errors, doubts)
@@ -87,13 +88,14 @@ def data_doubts(
         # Different models are compared on one log on purpose.
         if comparison is not None:
             doubts.append(
-                f"Both reports were made of one log, `{path.name}`, or parts of it: a "
-                "difference of their parameters does not show a change of the robot"
+                f"Both reports were made of one log, `{path.name}`, or of parts of it: "
+                "differences between their parameters do not show that the robot has "
+                "changed"
             )
     for fit, paths in zip(fits, places, strict=True):
         if log is not None and log.resolve() in paths:
             doubts.append(
-                f"`{fit.name}` was fitted to `{log.name}`, or to a part of it: errors "
-                "on another log say more"
+                f"`{fit.name}` was fitted to `{log.name}`, or to a part of it: compare "
+                "on another log"
             )
     return doubts

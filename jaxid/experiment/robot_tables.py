@@ -207,9 +207,10 @@ def require_gears(robot: Robot, columns: Columns) -> None:
     if is_of_motors and robot.drives.lack_stated_ratios:
         ratios = np.asarray(robot.drives.stated_ratios).tolist()
         raise InputError(
-            "`recording.side` or `forces_side` is that of the motors, but the gear "
-            "ratios are 1, while the robot's file states others (`<transmission>`): "
-            f"give `gear_ratios = {ratios}` in `[drives]`, or the side of the joints."
+            "`recording.side` or `forces_side` says that the log was recorded on the "
+            "motor side, but the gear ratios are 1, while the robot's file states "
+            f"others (`<transmission>`): give `gear_ratios = {ratios}` in `[drives]`, "
+            "or the side of the joints."
         )
 
 
@@ -280,7 +281,7 @@ def _require_plausible(robot: Robot, limits: dict[str, np.ndarray]) -> None:
         if fault:
             cure = "give the limits in metres, inf for none"
             if robot.revolute[j]:
-                cure = 'for degrees add `angle_unit = "deg"`, and inf means no limit'
+                cure = 'for degrees, add `angle_unit = "deg"`; inf means no limit'
             raise InputError(f"joint `{name}` {fault}: {cure}.")
 
 

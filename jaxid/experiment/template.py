@@ -48,10 +48,11 @@ otherwise.
 #   jaxid identify experiment.toml log.csv -o report/   parameters and torque errors
 """
 SUMMARIES = {
-    "filter": "Filter of the logs. Without `cutoff` the logs choose it from 2, 3.5, 5 "
-    "and 10 Hz and what the motion suggests; from a list like `[5.0, 20.0]` likewise.",
-    "load": "Known load that is on the robot in some logs only: "
-    "`jaxid gains` finds the true forces.",
+    "filter": "Filter of the logs. Without `cutoff`, the best of 2, 3.5, 5 and 10 Hz "
+    "and of values that suit the motion is chosen by errors on parts of the "
+    "logs; with a list like `[5.0, 20.0]`, the best of the list.",
+    "load": "Known load that the robot carries in some logs only: `jaxid gains` finds "
+    "the true forces.",
     "recording": f"Columns of the logs ({', '.join(READERS)}). "
     'A pattern ("{}" stands for the joint\'s number, "{name}" for its name), '
     "a list of names, or positions from 0.",
@@ -242,8 +243,8 @@ def _stated_ratios(robot: Robot) -> str:
     """Return a comment with the gear ratios that the robot's file states."""
     value = toml_text(np.asarray(robot.drives.stated_ratios).tolist()) or ""
     text = (
-        "The robot's file states these ratios (`<transmission>`), in place of those "
-        'above, for logs of the motors\' side (`side = "motor"`)'
+        "These ratios are in the robot's file (`<transmission>`). Use them instead of "
+        'those above if the logs were recorded on the motor side (`side = "motor"`)'
     )
     return "\n".join([*_comment(f"{text}:"), f"# gear_ratios = {value}"]) + "\n"
 

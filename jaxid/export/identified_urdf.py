@@ -186,15 +186,15 @@ def _require_same_robot(robot: Robot, file_robot: Robot, source: FilePath) -> No
         )
     if robot.followers != file_robot.followers:
         raise InputError(
-            f"`{source}` has other relations between joints (`<mimic>`) than the robot "
-            "of the fit: give its own file."
+            f"`{source}` does not have the same relations between joints (`<mimic>`) "
+            "as the robot of the fit: give the file of that robot."
         )
     for joint, name in enumerate(robot.joint_names):
         if robot.revolute[joint] != file_robot.revolute[joint]:
             words = "turns" if file_robot.revolute[joint] else "slides"
             raise InputError(
                 f"joint `{name}` {words} in `{source}`, but not in the robot of the "
-                "fit: give its own file."
+                "fit: give the file of that robot."
             )
     is_on_body = np.array(robot.parent) >= 0
     for quantity in ("axis", "rotation", "offset"):
@@ -206,7 +206,7 @@ def _require_same_robot(robot: Robot, file_robot: Robot, source: FilePath) -> No
         if deviations.max(initial=0.0) > MAX_DEVIATION:
             raise InputError(
                 f"`{source}` has a different `{quantity}` from the robot of the fit: "
-                "give its own file."
+                "give the file of that robot."
             )
 
 

@@ -47,8 +47,8 @@ GAIN_SYMBOLS = {"stiffness": "a", "damping": "B", "feed_forward": "f"}
 OPTIONAL_VALUES = ("integral_gain", "feed_forward")
 """Values of `simulator_values` that most servos lack."""
 FEED_FORWARD_CURE = (
-    "position actuators have no velocity feed-forward: give as control the command "
-    "plus feed forward / stiffness times its rate"
+    "position actuators have no velocity feed-forward: set the control to the command "
+    "plus (feed forward / stiffness) times the rate of the command"
 )
 """How a simulator moves like servos that feed the velocity of the command forward."""
 
@@ -64,8 +64,8 @@ def servo_stiffness(fit: ServoFit) -> Joints:
     if not is_known.any():
         raise InputError(
             "`stiffness` [N m/rad] of `identify_rollout` is needed: no known load "
-            "determines it, and positions determine only ratios to it. Any number "
-            "gives the same motion of a robot without bodies."
+            "determines it, and positions determine only ratios to it. For a robot "
+            "without bodies, any number gives the same motion."
         )
     return np.where(is_known, values, np.median(values[is_known]))
 
@@ -147,8 +147,8 @@ def simulator_table(fit: ServoFit) -> Table:
         remarks.append(Remark(FEED_FORWARD_CURE, Status.DOUBTFUL))
     if not fit.hold:
         remarks.append(
-            "the delay is that of interpolated commands: commands that are held act "
-            "half a step later"
+            "the delay is for interpolated commands; commands that are held act half "
+            "a step later"
         )
     return Table(
         "actuators of simulators",

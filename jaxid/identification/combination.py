@@ -97,8 +97,8 @@ def combine(fits: Sequence[Fit], maps, offsets=None) -> tuple[Vector, Uncertaint
     for first_fit, second_fit in itertools.combinations(fits, 2):
         if has_common_rows(first_fit.time_blocks, second_fit.time_blocks):
             raise InputError(
-                f"`{first_fit.name}` and `{second_fit.name}` have seen "
-                "the same data, which would count twice."
+                f"`{first_fit.name}` and `{second_fit.name}` contain the same data, "
+                "which would count twice."
             )
     if offsets is None:
         offsets = [np.zeros(fit.base.size) for fit in fits]

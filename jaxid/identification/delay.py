@@ -115,8 +115,9 @@ def with_unknown_delay(
         parameter = fit.base.names[int(np.argmax(ratios))]
         note = (
             f"intervals include a delay of the forces of {delay}: they are up to "
-            f"{significant(ratios.max(), 2)} times as wide as without it, most that of "
-            f"`{parameter}`; faster motion determines the delay better."
+            f"{significant(ratios.max(), 2)} times as wide as without it, with the "
+            f"largest change for `{parameter}`; faster motion determines the delay "
+            "better."
         )
         notes = (*notes, note)
     return dataclasses.replace(fit, uncertainty=wider_uncertainty, notes=notes)

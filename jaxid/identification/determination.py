@@ -63,7 +63,7 @@ class UndeterminedDirection(eqx.Module):
             return f"{names[0]} is not determined"
         if len(names) > 5:
             names = [*names[:4], f"{len(names) - 4} others"]
-        return f"{', '.join(names[:-1])} and {names[-1]} cannot be told apart"
+        return f"{', '.join(names[:-1])} and {names[-1]} cannot be distinguished"
 
 
 def status_of(open_share: float) -> Status:

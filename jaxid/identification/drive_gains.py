@@ -81,7 +81,7 @@ class DriveGains(Summarised, eqx.Module):
         if names:
             text = (
                 f"These logs do not determine the gain of {', '.join(names)}, which "
-                "stays 1: take a heavier load, or move faster and in more poses"
+                "stays 1: use a heavier load, or move faster and in more poses"
             )
             remarks.append(Remark(text, Status.DOUBTFUL))
         return remarks
@@ -89,7 +89,7 @@ class DriveGains(Summarised, eqx.Module):
     def summary(self) -> Table:
         """Return a table of the gains with their 95 % intervals."""
         return interval_table(
-            "true forces over those of the logs",
+            "gains: true force over the force in the log",
             self.joint_names,
             ("",) * len(self.joint_names),
             self.gains,
@@ -153,8 +153,8 @@ def identify_drive_gains(
     is_determined &= relative_deviations < MAX_DEVIATION
     if not is_determined.any():
         raise InputError(
-            "the load determines no gain: describe its centre of mass and inertia, "
-            "too, take a heavier one, or move every joint faster."
+            "the load determines no gain: describe its centre of mass and inertia as "
+            "well, use a heavier load, or move every joint faster."
         )
     # The gain 1 / c changes by -1 / c² times a small change of c.
     slopes = np.where(is_determined, -1.0 / reciprocals**2, 0.0)

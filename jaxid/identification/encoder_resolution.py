@@ -108,7 +108,7 @@ def resolution_note(
     if len(worst_parameters) > MAX_NAMES:
         names.append(f"and {len(worst_parameters) - MAX_NAMES} more")
     return (
-        "the encoders are so coarse that parameters are shifted, in standard "
+        "the encoders are so coarse that they shift parameters. In standard "
         f"deviations: {', '.join(names)}. Their intervals are too narrow: move faster, "
         "lower the cut-off of the filter, or leave slow rows out (`rows.min_speed`).",
     )

@@ -114,14 +114,14 @@ class FilterChoice(eqx.Module):
     def __str__(self):
         cutoff = f"the logs are filtered at {self.cutoffs[self.best]:.3g} Hz"
         if len(self.candidates) == 1:
-            return f"{cutoff}, since they are too short for a choice between cut-offs."
+            return f"{cutoff}: they are too short for a choice between cut-offs."
         order = np.argsort(self.cutoffs).tolist()
         errors = ", ".join(
             f"{self.cutoffs[k]:.3g} Hz {percent(float(self.curve[k]))} %" for k in order
         )
         return (
-            f"{cutoff}. Errors on parts of the logs that the fit had not seen, by the "
-            f"cut-off of the fit, all in a band of {self.band:.3g} Hz: {errors}."
+            f"{cutoff}. Errors on parts of the logs that were left out of the fit, for "
+            f"each cut-off, all in a band of {self.band:.3g} Hz: {errors}."
         )
 
 

@@ -289,7 +289,7 @@ class Fit(Summarised, eqx.Module):
             ),
             (
                 "residual",
-                f"{percent(self.residual, 3)} % of the forces (norms of all rows)",
+                f"{percent(self.residual, 3)} % of the forces (norms over all rows)",
             ),
             (
                 "estimates",
@@ -308,7 +308,7 @@ class Fit(Summarised, eqx.Module):
             return [Remark(text, Status.GOOD)]
         combinations = "1 combination" if count == 1 else f"{count} combinations"
         worst_share = max(direction.uncertainty for direction in self.undetermined)
-        consequence = "some of which were not moved at all"
+        consequence = "some of which these logs do not excite at all"
         if np.isfinite(worst_share):
             share = percent(worst_share)
             consequence = (

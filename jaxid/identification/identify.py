@@ -220,7 +220,7 @@ def _shrinkage_notes(values: BaseVector, solution: AbstractSpectralSolution) -> 
     if not count:
         return ()
     return (
-        f"the solution pulls {count} of {len(values)} directions "
-        "of the parameters to less than half of what the data say: "
-        "standard deviations do not include the bias that results.",
+        f"regularisation shrinks {count} of {len(values)} combinations of parameters "
+        "to less than half of their value without it: standard deviations do not "
+        "include the resulting bias.",
     )

@@ -83,7 +83,7 @@ def identify_batch(
     _check_arguments(base, motion, forces, mask, robots)
     if base.model.memory is not None:
         raise InputError(
-            "friction with memory needs one data set at a time: call `identify`."
+            "friction with memory works with one data set at a time: call `identify`."
         )
     if weights is None:
         if is_traced(robot.limits, robot.drives):

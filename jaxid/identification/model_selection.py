@@ -318,7 +318,8 @@ class ModelChoice(Summarised):
         deviations = [slope * x.std(ddof=1) for x in differences]
         errors = [trial.error for trial in trials]
         return Table(
-            "models by their errors on parts that were left out",
+            "models and their errors on parts of the logs that were left out of the "
+            "fit",
             Column("model", [trial.name for trial in trials]),
             Column("parameters", [trial.size for trial in trials]),
             Column("error", errors, "%", lambda x: percent(x, 3)),
@@ -336,7 +337,7 @@ class ModelChoice(Summarised):
         promise = percent(self.promise)
         summary = (
             f"Chosen: {self.chosen.name}. On further data of this kind expect errors "
-            f"of {promise} % of the forces (RMS {self.band}); with the file as it is, "
+            f"of {promise} % (RMS {self.band}); with the file as it is, "
             f"{percent(first_error)} %."
         )
         status = Status.GOOD
@@ -344,18 +345,19 @@ class ModelChoice(Summarised):
             # The promise leaves out longer parts than the search does.
             status = Status.DOUBTFUL
             summary += (
-                " Where longer parts are left out it is no better: record longer."
+                " If longer parts are left out, the chosen model is not better: "
+                "record longer."
             )
         remarks = [
             Remark(summary, status),
             Remark(
-                f"In the table all models have the same rows, {self.band}; "
+                f"All models in the table were compared on the same rows, {self.band}; "
                 f"{self.parts} were left out in turn. A change is kept if it lowers "
-                "the errors of the parts, relative to what they were, by more than two "
-                "standard deviations of their mean, and the error in all by 1 %"
+                "the error by 1 % in total, and the relative errors of the parts by "
+                "more than two standard deviations of their mean"
             ),
         ]
         if not self.is_complete:
-            text = "The time ended before all changes were tried."
+            text = "The time limit was reached before all changes were tried."
             remarks.append(Remark(text, Status.DOUBTFUL))
         return remarks

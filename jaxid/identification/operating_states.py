@@ -62,7 +62,7 @@ class StatesFit(Summarised, eqx.Module):
     def summary(self) -> Table:
         """Return a table of all estimates with their 95 % intervals."""
         return interval_table(
-            "parameters that all states share, then those of each state",
+            "parameters shared by all states, then those of each state",
             self.names,
             self.units,
             self.parameters,

@@ -182,12 +182,12 @@ class Comparison(Summarised, eqx.Module):
         tests = len(verdicts) - verdicts.count(Verdict.UNKNOWN)
         chance = 1.0 - LEVEL
         return [
-            f"{verdicts.count(Verdict.CHANGED)} of {tests} parameters have changed: if "
-            "none had, the chance to call any of them so would be "
+            f"{verdicts.count(Verdict.CHANGED)} of {tests} parameters have changed. If "
+            "none had, the probability of calling any of them changed would be "
             f"{100 * chance:.3g} % at most (Holm)",
             f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero lies "
-            f"outside the {100 * LEVEL:g} % interval of their difference; of "
-            f"{tests} parameters that never change, about {chance * tests:.2g} look so",
+            f"outside the {100 * LEVEL:g} % interval of their difference. Of {tests} "
+            f"parameters that do not change, about {chance * tests:.2g} look so",
         ]
 
     def group_summary(self) -> Table:
@@ -205,7 +205,7 @@ class Comparison(Summarised, eqx.Module):
             Column("kind", [group["name"] for group in groups]),
             Column("parameters", [group["parameters"] for group in groups]),
             Column("statistic", [group["statistic"] for group in groups]),
-            Column("chance\nwithout a change", chances, kind="number"),
+            Column("probability\nby chance", chances, kind="number"),
             Column("verdict", verdicts),
             status=[_status(group["changed"]) for group in groups],
         )

@@ -177,12 +177,11 @@ class Payload(Summarised, eqx.Module):
         residual, loaded_residual = self.residuals
         if loaded_residual > MAX_RESIDUAL_RATIO * residual + SMALL_RESIDUAL:
             return Remark(
-                "No load explains the forces: the model misses "
-                f"{percent(loaded_residual)} % of them with it, and "
-                f"{percent(residual)} % without. Is it another body that carries the "
-                "load? Or is the load set in the robot's controller, which then takes "
-                "its gravity out of the forces? Set it to zero there, and record "
-                "again.",
+                "No load explains the forces: the torque error of the model is "
+                f"{percent(loaded_residual)} % with it, and {percent(residual)} % "
+                "without. Does another body carry the load? Or is the load set in the "
+                "robot's controller, which then subtracts its gravity from the "
+                "forces? Set it to zero there, and record again.",
                 Status.BAD,
             )
         if not np.isfinite(self.distance):
@@ -282,7 +281,8 @@ def _possible_body(
     )
     if not error_bound <= MAX_ERROR_BOUND * (1.0 + distance**2):
         raise RuntimeError(
-            "no body was proved to be the nearest: are both runs of one robot?"
+            "the nearest possible body was not found with certainty: are both runs "
+            "from the same robot?"
         )
     return parameters, distance
 

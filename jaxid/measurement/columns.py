@@ -236,7 +236,7 @@ def with_lerobot_calibration(
         symbol = getattr(unit, "symbol", unit)
         raise InputError(
             f'`lerobot_calibration` is for `angle_unit = "%"`, but that is {symbol}: '
-            'write "%"; or leave the calibration out, as in degrees LeRobot counts '
+            'write "%". For degrees, leave the calibration out: LeRobot then counts '
             "from the middle of each range."
         )
     try:
@@ -275,8 +275,8 @@ def _as_unit(name: str, unit: Unit | float, quantity: Quantity) -> Unit:
         return unit
     if not np.isfinite(unit) or unit == 0:
         raise InputError(
-            f"`{name}` must be a unit, or the value of 1 in the log, which is "
-            f"finite and not zero, but is {unit}."
+            f"`{name}` must be a unit, or the value of 1 in the log, a finite number "
+            f"other than zero, but is {unit}."
         )
     return Unit(f"{unit:g}", float(unit), quantity)
 
@@ -335,8 +335,8 @@ class Log:
         if not begins_again.any():
             return array
         self.notes.append(
-            f"`{channel}` jump by {size}, as if a counter had overflowed: the jumps "
-            "were removed"
+            f"`{channel}` jump by {size}, as a counter does when it overflows: the "
+            "jumps were removed"
         )
         counts = np.unwrap(array, period=size, axis=0)
         turns = np.round(np.median(counts, axis=0) / size)

@@ -452,7 +452,8 @@ def prepare(
         j = slow_joints[0]
         raise InputError(
             f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of "
-            f"`min_speed` in `{name}`: take a smaller one, or a log in which it moves."
+            f"`min_speed` in `{name}`: use a smaller value, or a log in which the "
+            "joint moves."
         )
     return observations.replace(mask=mask)
 
@@ -468,8 +469,9 @@ def _usable_segments(grid: TimeGrid, edge: int, factor: int, name: str) -> TimeG
         samples = max(b - a for a, b in grid.segments)
         raise InputError(
             f"the longest segment of `{name}` has {samples} samples at "
-            f"{1 / grid.sample_time:.6g} Hz, but the filter takes {edge} at each end, "
-            f"and {MIN_ROWS * factor} more are needed: {grid.cure_of_short_segments}."
+            f"{1 / grid.sample_time:.6g} Hz, but the filter removes {edge} at each "
+            f"end, and {MIN_ROWS * factor} more are needed: "
+            f"{grid.cure_of_short_segments}."
         )
     notes = grid.notes
     lost_segments = len(grid.segments) - len(segments)

@@ -196,8 +196,8 @@ def _bad_row_note(complaints: Complaints, rows: int, max_share: float) -> str:
         words = f"{words}; and {len(texts) - MAX_NAMED_ROWS} more"
     share = inner_count / rows
     cure = (
-        f"repair the log, or let `bad_rows` be above {share:.2g} (fraction), which "
-        "leaves them out"
+        f"repair the log, or set `bad_rows` above {share:.2g} (a fraction) to leave "
+        "these rows out"
     )
     if share > MAX_SPARED_ROWS:
         cure = (
@@ -354,7 +354,7 @@ def scan_log(
     memory = filter.memory(grid.sample_time)
     if memory is None:
         raise NeedsMemory(
-            f"`{type(filter).__name__}` needs the whole log: take another filter, or "
+            f"`{type(filter).__name__}` needs the whole log: use another filter, or "
             "`read_recording`."
         )
 

@@ -139,8 +139,8 @@ def find_grid(
     segments = stretches.segments
     if not segments:
         raise InputError(
-            f"`{source}` has no four rows in sequence: its time stamps are "
-            f"{statistics.median:.6g} s apart at the median, with "
+            f"`{source}` has no four rows in sequence without a gap: its time stamps "
+            f"are {statistics.median:.6g} s apart at the median, with "
             f"{len(stretches.pauses)} gaps; check `time_unit`, or give `sample_time`."
         )
     grid = TimeGrid(sample_time, segments)
@@ -161,8 +161,8 @@ def _step_statistics(stamps: Vector, source: str, limits: Pauses) -> StepStatist
     steps = steps[steps > 0]
     if not steps.size:
         raise InputError(
-            f"time of `{source}` stands still: name another column of time stamps, or "
-            "give `sample_time`."
+            f"the time of `{source}` does not advance: name another column of time "
+            "stamps, or give `sample_time`."
         )
     median = float(np.median(steps))
     absolute_deviation = float(np.median(np.abs(steps - median)))
@@ -222,7 +222,7 @@ def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> Texts:
     pauses = stretches.pauses
     if origin != 0:
         notes.append(
-            f"time counts from the first row, which was stamped {origin:.9g} s"
+            f"time starts at zero at the first row, whose stamp was {origin:.9g} s"
         )
     if pauses:
         first_gap = stretches.start_times[1] - pauses[0]
@@ -230,10 +230,9 @@ def _gap_notes(grid: TimeGrid, stretches: Stretches, origin: float) -> Texts:
         plural = "s" if len(pauses) > 1 else ""
         notes.append(
             f"{len(pauses)} gap{plural} in time, the first after {first_gap:.6g} s, "
-            f"the longest of {longest_pause:.6g} s "
-            f"(sample time {grid.sample_time:.6g} s), "
-            "split the log into segments; a `largest_gap` above "
-            f"{longest_pause / grid.sample_time:.3g} would bridge them"
+            f"the longest of {longest_pause:.6g} s (sample time {grid.sample_time:.6g} "
+            "s), split the log into segments; a `largest_gap` above "
+            f"{longest_pause / grid.sample_time:.3g} would interpolate them"
         )
     lost_rows = stretches.rows - sum(b - a for a, b in grid.segments)
     if lost_rows:
@@ -248,7 +247,7 @@ def _require_forward(stamps: Vector, steps: Vector, row: int, source: str) -> No
     if backward_steps.size:
         i = int(backward_steps[0])
         raise NeedsMemory(
-            f"time of `{source}` runs backwards from {stamps[i]:.9g} s to "
+            f"the time of `{source}` runs backwards from {stamps[i]:.9g} s to "
             f"{stamps[i + 1]:.9g} s at row {row + i + 1}: sort the log, or split it "
             "where the clock was set back."
         )

@@ -84,9 +84,9 @@ def join_channels(
     """
     if stamps is None:
         raise InputError(
-            f"the channels of `{source}` have values at different rows, and so times "
-            "of their own: give `time` (its column of time stamps; bags have a clock) "
-            "instead of `sample_time`."
+            f"the channels of `{source}` have values in different rows, and so have "
+            "different times: give `time` (its column of time stamps; bags have a "
+            "clock) instead of `sample_time`."
         )
     order = np.argsort(stamps, kind="stable")
     order = order[np.isfinite(stamps[order])]
@@ -102,7 +102,7 @@ def join_channels(
     is_common = np.isfinite(np.hstack([*joined.values()])).all(axis=1)
     if not is_common.any():
         raise InputError(
-            f"the channels of `{source}` overlap nowhere in time: compare their clocks."
+            f"the channels of `{source}` do not overlap in time: check their clocks."
         )
     lost_rows = int(np.sum(~is_common))
     if lost_rows:
@@ -165,8 +165,8 @@ def hold_notes(channels: NamedChannels, sample_time: float) -> list[str]:
             if channel == "forces":
                 delay = 0.5 * (length - 1.0) * sample_time
                 cure = (
-                    "unless the drive itself holds them, remove their delay by "
-                    f"`force_delay = {delay:.3g}`, and keep `filter.cutoff` below "
+                    "unless the drive itself holds the values, remove their delay "
+                    f"with `force_delay = {delay:.3g}`, and keep `filter.cutoff` below "
                     f"{PASSED_BAND * rate:.3g} Hz"
                 )
             notes.append(
@@ -186,13 +186,12 @@ def _rate(times: Vector) -> float:
 def _rate_note(channel: str, joints: list[str], rate: float, main_rate: float) -> str:
     """Return a remark about a channel with other times, and what its rate costs."""
     note = (
-        f"`{channel}` of joints {', '.join(joints)} have times of their own "
-        f"({rate:g} Hz): interpolated linearly at those of the angles "
-        f"({main_rate:g} Hz)"
+        f"`{channel}` of joints {', '.join(joints)} have their own times ({rate:g} "
+        f"Hz): interpolated linearly at those of the angles ({main_rate:g} Hz)"
     )
     if rate < SLOW_RATE * main_rate:
         note += (
-            f"; this weakens what is faster than {PASSED_BAND * rate:.3g} Hz: record "
+            f"; this weakens motion faster than {PASSED_BAND * rate:.3g} Hz: record "
             "both at one rate, or keep `filter.cutoff` below that"
         )
     return note

@@ -76,7 +76,7 @@ def stamp_order(
     )
     if is_refused:
         raise InputError(
-            f"time of `{source}` runs backwards {place}, and some times are there "
+            f"the time of `{source}` runs backwards {place}, and some times occur "
             "twice: the clock was set back; cut the log there into two files, or, if "
             "the motion goes on there as if nothing had happened, give `sample_time` "
             f"(about {step:.4g} s)."

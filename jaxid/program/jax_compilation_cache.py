@@ -87,9 +87,9 @@ def _require_private(folder: Path):
         status.st_uid != os.getuid() or status.st_mode & 0o022
     ):
         raise InputError(
-            f"`{folder}` belongs to somebody else, "
-            "or others can write to it, but code from there is run: "
-            f"give {VARIABLE} a folder of your own, or turn the cache off with `off`."
+            f"`{folder}` belongs to somebody else, or others can write to it. Code "
+            f"from this folder is executed: give {VARIABLE} a folder of your own, or "
+            "turn the cache off with `off`."
         )
 
 

@@ -17,9 +17,9 @@ from .result_files import write_page_and_table
 from .result_records import comparison_rows, error_record
 
 ONE_MOTION = (
-    "Effects that the model lacks also cause differences between runs of different "
-    "motions. For two runs of one motion, `jaxid states` is more sensitive: it fits "
-    "both at once, with the same inertial parameters."
+    "Effects that the model lacks also cause differences between runs with different "
+    "motions. For two runs of the same motion, use `jaxid states`, which is more "
+    "sensitive: it fits both at once, with the same inertial parameters."
 )
 
 
@@ -114,7 +114,7 @@ class ComparisonReport(Summarised):
         if records:
             title = next(iter(self.errors.values())).name
             figure = model_force_figure(self.errors, self.robot, title)
-            sections.append(("Both models over one log", [figure, self.error_table()]))
+            sections.append(("Both models on one log", [figure, self.error_table()]))
         if comparison is not None:
             rows = comparison_rows(comparison)
             content |= {

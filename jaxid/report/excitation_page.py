@@ -36,7 +36,7 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     unpublished_limits = ", ".join(plan.limits.limits.assumed)
     if unpublished_limits:
         doubts.append(
-            f"The maker has not published these limits, so they are assumed: "
+            "The manufacturer has not published these limits, so they are assumed: "
             f"{unpublished_limits}"
         )
     if plan.limits.assumed:
@@ -103,7 +103,7 @@ def write_excitation(
             ],
         ),
         ("Use of the limits", use),
-        ("Gain over a random motion", [gain, criteria]),
+        ("Comparison with a random motion", [gain, criteria]),
         ("Expected standard deviations", [deviations]),
         provenance(settings),
     ]

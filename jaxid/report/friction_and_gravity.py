@@ -122,7 +122,7 @@ def _measured_friction(model: Curve, speeds: np.ndarray, errors: np.ndarray) -> 
     friction_sums = np.bincount(classes, friction, SPEED_CLASSES)
     mean_speeds = speed_sums[is_shown] / counts[is_shown]
     mean_friction = friction_sums[is_shown] / counts[is_shown]
-    name = "measured, mean of a class of speed"
+    name = "measured, mean in a range of speeds"
     return Curve(mean_speeds, mean_friction, name, GREY, "points")
 
 

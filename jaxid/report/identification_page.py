@@ -64,8 +64,7 @@ def identification_page(report: Report, figures: Figures) -> str:
         f"{base.size} base parameters of {robot.joints} joints, from {logs} "
         f"log{ending}.",
         "All numbers are in result.json and parameters.csv beside this page. Curves "
-        "of long logs keep the smallest and largest value of each pixel column, so "
-        "that no peak is lost.",
+        "of long logs are thinned out, but keep every peak.",
     )
 
 
@@ -87,10 +86,10 @@ def _three_numbers(report: Report) -> Markup:
     """Return the torque error in all and of the worst joint, and what is determined."""
     fit = report.fit
     logs = report.verification
-    motion = "on motion that the fit has not seen"
+    motion = "on motion that the fit did not use"
     if not logs:
         logs = report.identification
-        motion = "on the motion of the fit: no other log was given"
+        motion = "on the motion of the fit, since no other log was given"
     band = logs[0].band_words
     errors = relative_joint_errors(logs)
     worst_joint = int(np.argmax(errors))
@@ -150,10 +149,10 @@ def _physics(report: Report, figures: Figures) -> Sections:
         )
         yield "Before and after", [text, figures["before_and_after"]]
     text = (
-        "The line is the model. Each point is the measured friction in a range of "
-        "speeds: the mean force there, minus gravity and inertia of the model. If the "
-        "points do not follow the line, friction has a different shape: `jaxid choose` "
-        "tries further laws."
+        "The line is the model. Each point is the mean measured friction in a range "
+        "of speeds: the force minus the gravity and inertia forces of the model. If "
+        "the points do not follow the line, friction has a different shape: `jaxid "
+        "choose` tries further laws."
     )
     yield "Friction", [text, figures["friction"]]
     log = report.verification[0] if report.verification else report.identification[0]
@@ -180,15 +179,15 @@ def _estimates(report: Report) -> list[Any]:
     """Return friction, rotors and gravity of each joint; all parameters folded."""
     fit = report.fit
     text = (
-        "Each estimate is given ± half the width of its 95 % interval. Masses times "
-        "distances belong to the body that the joint moves, together with all that "
-        "forces cannot separate from them."
+        "Each estimate is followed by ± half the width of its 95 % interval. Masses "
+        "times distances are those of the body that the joint moves, combined with "
+        "other parameters that forces cannot separate from them."
     )
     note = (
-        "* together with what forces cannot separate from it: see its combination. "
-        "Open: the uncertainty of the torques of random motions that follows from its "
-        "interval, in percent. A small parameter matters little, however wide its "
-        "interval."
+        "* combined with other parameters that forces cannot separate from it: see "
+        "its combination. Open: the uncertainty of the torques of random motions that "
+        "follows from its interval, in percent. A small parameter matters little, "
+        "however wide its interval."
     )
     doubts = [fit.determination] if fit.undetermined else []
     all_parameters = folded(

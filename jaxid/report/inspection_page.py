@@ -45,10 +45,10 @@ def write_inspection(
     undetermined = max(len(fit.undetermined) for _, fit in logs)
     residual = percent(max(fit.residual for _, fit in logs))
     numbers = tiles(
-        (str(len(findings)), "findings that deserve a look", Status.NEUTRAL),
+        (str(len(findings)), "findings to look at", Status.NEUTRAL),
         (
             f"{residual} %",
-            "of the forces not explained by a fit to the log",
+            "of the forces that a fit to the log does not explain",
             Status.NEUTRAL,
         ),
         (

@@ -103,8 +103,9 @@ def correlation_blocks(fit: Fit) -> list[Any]:
     names = np.asarray(fit.base.names)
     text = (
         f"{len(values)} pairs have a correlation of {MIN_CORRELATION} or more: the "
-        "logs determine their combination better than each of them. A motion in which "
-        f"these joints move differently separates them. At most {MAX_PAIRS} are shown."
+        "logs determine their combination better than each of them. To separate them, "
+        "record a motion in which these joints move more independently. At most "
+        f"{MAX_PAIRS} are shown."
     )
     table = Table(
         "",

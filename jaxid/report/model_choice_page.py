@@ -32,18 +32,18 @@ def write_model_choice(
     first_error = percent(relative_error(choice.first_predictions))
     sizes = f"{choice.path[0].size} → {choice.chosen.size}"
     numbers = tiles(
-        (f"{error} %", "of the forces missed by the chosen model", Status.NEUTRAL),
+        (f"{error} %", "error of the chosen model (RMS over RMS)", Status.NEUTRAL),
         (
             f"{first_error} %",
-            "of the forces missed by the file as it is",
+            "error of the model as the file says",
             Status.NEUTRAL,
         ),
-        (sizes, "parameters of the file, and of the chosen model", Status.NEUTRAL),
+        (sizes, "number of parameters: file as it is → chosen model", Status.NEUTRAL),
     )
     sections = [
         ("At a glance", [verdict, numbers, remarks]),
-        ("Both models over one log", [force_figure(choice, robot)]),
-        ("Error against size", [size_figure(choice)]),
+        ("Both models on one log", [force_figure(choice, robot)]),
+        ("Error against number of parameters", [size_figure(choice)]),
         ("All models", [Table("", *table.columns, status=table.status)]),
         provenance(settings),
     ]
@@ -54,7 +54,7 @@ def size_figure(choice: ModelChoice) -> Figure:
     """Return the error on unseen parts of each model, against its size."""
     curves = [
         _trial_curve(choice.others, "other models", GREY, "points"),
-        _trial_curve(choice.path, "way of the search", PREDICTION_COLOUR, "line"),
+        _trial_curve(choice.path, "path of the search", PREDICTION_COLOUR, "line"),
     ]
     panel = Panel(
         curves,
@@ -90,8 +90,8 @@ def force_figure(choice: ModelChoice, robot: Robot) -> Figure:
     first_error = percent(relative_error([first_prediction]))
     error = percent(relative_error([prediction]))
     title = (
-        f"{prediction.name}, each part by fits without it: {error} % by the chosen "
-        f"model, {first_error} % by the file as it is"
+        f"{prediction.name}, each part predicted by a fit without it: {error} % by the "
+        f"chosen model, {first_error} % by the file as it is"
     )
     predictions = {FIRST_MODEL: first_prediction, CHOSEN_MODEL: prediction}
     return model_force_figure(predictions, robot, title)

@@ -49,8 +49,8 @@ def payload_answer(
     figures = []
     for errors, loaded_errors in zip(unloaded, loaded, strict=True):
         title = (
-            f"{errors.name}: {percent(errors.relative)} % of the forces missed without "
-            f"the payload, {percent(loaded_errors.relative)} % with it"
+            f"{errors.name}: {percent(errors.relative)} % error (RMS) without the "
+            f"payload, {percent(loaded_errors.relative)} % with it"
         )
         predictions = {
             "model without the payload": errors,
@@ -61,16 +61,19 @@ def payload_answer(
         figures.insert(0, payload_figure(payload, robot, loaded[0]))
     return Answer(
         f"{robot.name}: payload",
-        f"The payload on {joint} has a mass of {mass} ± {half_width} kg, and the model "
-        f"with it misses {loaded_residual} % of the forces",
+        f"The payload on {joint} has a mass of {mass} ± {half_width} kg, and the "
+        f"torque error of the model with it is {loaded_residual} %",
         [
             (f"{mass} ± {half_width} kg", "mass, with its 95 % interval"),
-            (f"{loaded_residual} %", "of the forces missed with the payload"),
-            (f"{residual} %", "of the forces missed without the payload"),
+            (
+                f"{loaded_residual} %",
+                ("torque error (RMS over RMS) of the model with the payload"),
+            ),
+            (f"{residual} %", "torque error of the model without the payload"),
         ],
         figures,
-        f"The frame is that of the body that {joint} moves. A_c to F_c are about the "
-        "centre of mass, along the axes of this frame.",
+        f"All values are in the frame of the body that {joint} moves. A_c to F_c are "
+        "about the centre of mass, along the axes of this frame.",
         tool_lines(payload, joint),
     )
 
@@ -140,14 +143,14 @@ def gains_answer(
     height = 0.8 + 0.3 * robot.joints
     return Answer(
         f"{robot.name}: gains of the drives",
-        f"The logs determine {count} of {robot.joints} gains, and the model with the "
-        f"load misses {misfit} % of the forces",
+        f"The logs determine {count} of {robot.joints} gains, and the torque error of "
+        f"the model with the load is {misfit} %",
         [
             (f"{count} of {robot.joints}", "gains that the logs determine"),
-            (f"{misfit} %", "of the forces missed with the load as described"),
+            (f"{misfit} %", "torque error (RMS over RMS) with the load as described"),
             (
                 f"{min_misfit} %",
-                "of the forces missed with the best load of the same mass",
+                "torque error with the best load of the same mass",
             ),
         ],
         [Figure("Gains with their 95 % intervals", [panel], height=height)],
@@ -182,7 +185,9 @@ def states_answer(states: StatesFit, errors: Mapping[str, Errors]) -> Answer:
         missed_share = percent(
             relative_error([x for logs in groups.values() for x in logs])
         )
-        numbers.append((f"{missed_share} %", "of the forces missed, over all states"))
+        numbers.append(
+            (f"{missed_share} %", ("torque error (RMS over RMS) over all states"))
+        )
         fits = {state: states.fit(state) for state in groups}
         figures.insert(0, state_friction_figure(fits, errors))
     return Answer(

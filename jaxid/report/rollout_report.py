@@ -43,7 +43,7 @@ BASELINES = {
 }
 """Headers of the errors of baselines."""
 NOT_VALIDATED = Remark(
-    "The simulation was not validated on an unseen log: use `--verify`",
+    "The simulation was not validated on another log: use `--verify`",
     Status.DOUBTFUL,
 )
 """Doubt about a simulation that was compared with the logs of its fit only."""
@@ -168,7 +168,7 @@ def _report(
         joints = ", ".join(np.array(errors.joint_names)[~is_good])
         text = f"The simulation is hardly closer to the robot than a baseline: {joints}"
         doubts.append(Remark(text, Status.DOUBTFUL))
-    logs = "logs that the fit has not seen" if is_unseen else "logs of the fit"
+    logs = "logs that the fit did not use" if is_unseen else "logs of the fit"
     comparison = Table(
         f"errors on {logs}, {errors.sample_words} (RMS)",
         Column("joint", errors.joint_names),

@@ -84,9 +84,7 @@ def fit_capsules(
             )
             capsules.append(capsule)
     if not capsules and faults is None:
-        raise InputError(
-            f"`{path}` has no collision geometry for the links that were asked for."
-        )
+        raise InputError(f"`{path}` has no collision geometry for these links.")
     return tuple(capsules)
 
 

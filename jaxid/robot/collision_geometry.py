@@ -114,8 +114,8 @@ def _mesh_vertices(
     file = next(filter(Path.is_file, files), None)
     if file is None:
         raise FileNotFoundError(
-            f"{tree.place(element)}: the mesh `{name}` is not there: "
-            "give its folder by `packages`."
+            f"{tree.place(element)}: the mesh `{name}` was not found: give its folder "
+            "as `packages`."
         )
     try:
         mesh: Any = trimesh.load(str(file), force="mesh", process=False)

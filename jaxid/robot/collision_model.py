@@ -79,7 +79,7 @@ class CollisionModel(Hashable):
             room = dict.fromkeys(self.pairs, np.inf)
         if not self.pairs:
             raise InputError(
-                "a collision model needs at least one pair of shapes that can meet."
+                "a collision model needs at least one pair of shapes that can touch."
             )
         self.groups = self._groups()
         self.room = tuple(
@@ -256,8 +256,8 @@ class CollisionModel(Hashable):
         i, k = sorted(names.index(name) for name in pair)
         if i >= len(self.capsules) or i == k:
             raise InputError(
-                f"`{pair[0]}` and `{pair[1]}` cannot meet: "
-                "pair a capsule with another shape."
+                f"`{pair[0]}` and `{pair[1]}` cannot touch: pair a capsule with "
+                "another shape."
             )
         return i, k
 

@@ -169,7 +169,7 @@ def loaded_followers(tree: Any, tip_chain: Sequence[Any]) -> list[Any]:
         if leader not in tree.joints:
             fault = "which `base` or `tip` leaves out: remove them"
         elif not is_linear:
-            fault = "by a polynomial: leave two coefficients of `polycoef`"
+            fault = "by a polynomial: keep only two coefficients of `polycoef`"
         if fault:
             raise tree.error(
                 joint,

@@ -343,7 +343,7 @@ class _Writer:
                 links = {"joint": f"{name} frame", "link": name}
                 self.effects.append(Effect(kind, name, words, links.get(kind, "")))
         if model.opt.density or model.opt.viscosity:
-            words = "the resistance of a medium"
+            words = "the resistance of a medium such as air or water"
             self.effects.append(Effect("option", "density", words, ""))
 
     def _add_mimic(self, joint: int, master: int, polynomial: np.ndarray):

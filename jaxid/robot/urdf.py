@@ -284,7 +284,7 @@ def _checked_range(tree: UrdfTree, joint: Any):
         unit = "radians, not degrees" if turns else "metres"
         raise tree.error(joint, f"{fault}: its limits must be in {unit}")
     if low > high:
-        cure = "exchange the ends, or state both"
+        cure = "exchange the two ends, or state both"
         raise tree.error(joint, f"ranges from {low:g} to {high:g}: {cure}")
     if high - low < MIN_RANGE:
         return -np.inf, np.inf
@@ -344,7 +344,7 @@ def _held_notes(tree: UrdfTree):
         )
     if tree.objects:
         links = owners("link", tree.objects)
-        notes.append(f"{links}: left out, as objects that float freely.")
+        notes.append(f"{links}: left out, because they float freely.")
     return notes
 
 
@@ -355,8 +355,9 @@ def _follower_notes(tree: UrdfTree):
         leader_name = tree.joints[follower.leader].get("name")
         yield (
             f"joint `{follower.name}`: follows another one, at {follower.factor:.4g} * "
-            f"`{leader_name}` + {follower.offset:.4g}; its body is number {number} "
-            f"(`m{number}`), its friction is included in that of `{leader_name}`."
+            f"`{leader_name}` + {follower.offset:.4g}; its body has the number "
+            f"{number} (`m{number}`); its friction is included in that of "
+            f"`{leader_name}`."
         )
 
 
@@ -366,8 +367,8 @@ def _effect_notes(tree: UrdfTree):
     for effect in tree.effects:
         groups.setdefault((effect.kind, effect.words), []).append(effect.name)
     return [
-        f"{owners(kind, names)}: the file states {words}; "
-        "it changes the forces, but the default model leaves it out."
+        f"{owners(kind, names)}: the file states {words}, which changes the forces; "
+        "the default model does not include it."
         for (kind, words), names in groups.items()
     ]
 
@@ -405,9 +406,9 @@ def _inertial_notes(tree: UrdfTree):
     notes = []
     if rounded_links:
         notes.append(
-            f"{owners('link', rounded_links)}: by rounding, a moment of inertia is "
-            "slightly larger than the sum of the others: the prior has the nearest "
-            "moments of a real body."
+            f"{owners('link', rounded_links)}: because of rounding, a moment of "
+            "inertia is slightly larger than the sum of the other two: the prior uses "
+            "the nearest moments that a real body can have."
         )
     light_bodies = [tree.joints[i].get("name") for i in np.flatnonzero(masses == 0.0)]
     if light_bodies:
@@ -418,9 +419,11 @@ def _inertial_notes(tree: UrdfTree):
     for link, fault in faults.items():
         if fault:
             # Only moments have a nearest value that can exist.
-            use = "the nearest possible ones are the prior and serve to check forces"
+            use = (
+                "the nearest possible values are used as the prior and to check forces"
+            )
             if IMPOSSIBLE not in fault:
-                use = f"it {IMPOSSIBLE}, so that inertias of the file are not used"
+                use = f"it {IMPOSSIBLE}, so the inertias of the file are not used"
             notes.append(f"link `{link}`: {fault}; {use}: correct its inertial.")
     densities = ball_densities(tree.bodies())
     dense_bodies = np.flatnonzero(densities > MAX_DENSITY)
@@ -428,8 +431,8 @@ def _inertial_notes(tree: UrdfTree):
         names = owners("joint", [tree.joints[i].get("name") for i in dense_bodies])
         notes.append(
             f"{names}: mass and moments of the body {IMPOSSIBLE}: "
-            f"{densities[dense_bodies[0]]:.2g} kg/m³ are more than any material has "
-            "(is a mass in grams, or are moments placeholders?); correct or remove "
-            "them."
+            f"{densities[dense_bodies[0]]:.2g} kg/m³ are more than the density of any "
+            "material (is a mass in grams, or are the moments placeholders?); correct "
+            "or remove the values."
         )
     return notes

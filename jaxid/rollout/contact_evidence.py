@@ -89,8 +89,8 @@ def contact_findings(robot: Robot, errors: RolloutErrors) -> list[Remark]:
     motion = np.bincount(motions[table.below]).argmax()
     span = times[table.below & (motions == motion)]
     text = (
-        f"Something seems to hold {table.point} at a height of {table.height:.3f} m: "
-        f"the simulation goes {1e3 * table.depth:.0f} mm below it, most often in "
+        f"Something seems to support {table.point} at a height of {table.height:.3f} "
+        f"m: the simulation goes {1e3 * table.depth:.0f} mm below it, most often in "
         f"{errors.motions[motion]} between {span[0]:.1f} and {span[-1]:.1f} s. These "
         "samples are included in all errors: leave them out of the logs"
     )

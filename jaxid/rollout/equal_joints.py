@@ -51,8 +51,8 @@ def joint_groups(
             for k in members:
                 if kinds[k] != names[k]:
                     raise InputError(
-                        f"`alike`: joint `{names[k]}` belongs to two kinds, but a "
-                        "joint may belong to one only."
+                        f"`alike`: joint `{names[k]}` belongs to two kinds, but may "
+                        "belong to only one."
                     )
                 kinds[k] = f"kind {' '.join(words)}"
     return tuple(

@@ -66,7 +66,7 @@ class RolloutErrors(Summarised):
         left_out = int(np.sum(~self.is_counted))
         if not left_out:
             return "every sample"
-        return f"every sample but {left_out} within contacts that were given"
+        return f"every sample but {left_out} within the given contacts"
 
     def summary(self, units: Sequence[str] = ("mrad or mm",)) -> Table:
         """Return a table of the errors of all motions.

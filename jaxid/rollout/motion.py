@@ -83,7 +83,8 @@ class ServoMotion:
         """
         if len({log.joints for log in logs}) != 1:
             raise InputError(
-                "`logs` must hold at least one log, and all with the same joints."
+                "`logs` must hold at least one log, and all logs must have the same "
+                "joints."
             )
         lead = math.ceil(MAX_DELAY / min(log.sample_time for log in logs))
         pieces = []
@@ -232,8 +233,8 @@ def _is_in_contact(log: Recording, contacts: Contacts) -> np.ndarray:
     for start, end in spans:
         if not start < end:
             raise InputError(
-                f"`contacts`: each is a start and a later end [s], not {start:g} and "
-                f"{end:g}."
+                f"`contacts`: each must be a start and a later end [s], not {start:g} "
+                f"and {end:g}."
             )
         within |= (log.time >= start) & (log.time <= end)
     return within

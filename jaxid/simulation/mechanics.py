@@ -209,7 +209,7 @@ def follow(
         raise InputError(
             f"the simulated robot diverged after {len(forces) * servo.sample_time:g} "
             "s: make the `servo` softer or `substeps` larger, and check that the "
-            "bodies can exist."
+            "bodies are physically possible."
         ) from failure
     return _servo_run(states, forces)
 

@@ -261,10 +261,10 @@ def with_leads(
         joint = int(np.argmax(use[nearest_phase]))
         excess = use[nearest_phase, joint] - 1.0
         raise InputError(
-            "no instant of the period can be reached from standstill within "
-            f"the limits: at best joint `{robot.joint_names[joint]}` exceeds "
-            f"one of them by {100 * excess:.3g} %: "
-            "take a motion that uses less of the limits."
+            "no instant of the period can be reached from standstill within the "
+            f"limits: at best, joint `{robot.joint_names[joint]}` exceeds one of them "
+            f"by {100 * excess:.3g} %: use a motion that stays further from the "
+            "limits."
         )
     return WithLeads(
         series,

@@ -175,7 +175,7 @@ def _cure_of_times(recording: Recording) -> str:
             "its stamps are uneven; if the robot samples evenly, give `recording."
             "sample_time` instead of them"
         )
-    return "its stamps do not show that, so record again"
+    return "its stamps do not show which rows, so record again"
 
 
 def held_forces(robot: Robot, recording: Recording) -> list[str]:
@@ -198,7 +198,7 @@ def held_forces(robot: Robot, recording: Recording) -> list[str]:
         if is_regular and hold_time > LIMITS.hold_time:
             findings.append(
                 f"the force of joint `{name}` is held for {1e3 * hold_time:.2g} ms "
-                "each time, and the angles are not, which makes it late by half of "
-                "that: log it as often as they are measured."
+                "each time, but the angles are not. The force is late by half of that "
+                "time: log it as often as the angles."
             )
     return findings

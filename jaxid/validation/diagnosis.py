@@ -234,8 +234,9 @@ def _examined_log(
         return _ExaminedLog(log, observations, observations)
     if not isinstance(log.source, SamplesOnDisk):
         raise InputError(
-            "`log` holds filtered samples in memory, which show no faults of single "
-            "channels: give the recording, and these as `observations`."
+            "`log` holds filtered samples in memory, which do not show faults of "
+            "single channels: give the recording itself, and the filtered samples as "
+            "`observations`."
         )
     excerpt = read_excerpt(log, MAX_SAMPLES)
     reason = ""

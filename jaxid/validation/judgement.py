@@ -189,23 +189,23 @@ def _verdict(report: Report, findings: Sequence[Remark]) -> Remark:
     # The end of a log is less new than another log.
     is_split = report.settings.get("split") is not None
     motion = "the rest of its logs" if is_split else "other logs"
-    text = f"it misses {percent(error)} % of the RMS torque of {motion}."
+    text = f"its torque error on {motion} is {percent(error)} % (RMS)."
     if error > ERRORS.good:
-        text = f"A usable model: nothing else speaks against it, but {text}"
+        text = f"A usable model: no other check found a problem, but {text}"
         return Remark(text, Status.NEUTRAL)
-    return Remark(f"A good model: nothing speaks against it, and {text}", Status.GOOD)
+    return Remark(f"A good model: no check found a problem, and {text}", Status.GOOD)
 
 
 def _judge_errors(report: Report) -> Iterator[Remark]:
     """Judge the torque errors on motions that the fit has not seen."""
     if not report.verification:
         yield Remark(
-            "The model was not validated on an unseen log: use `--verify` or `--split`",
+            "The model was not validated on another log: use `--verify` or `--split`",
             Status.DOUBTFUL,
         )
         yield _error_remark(report, report.identification, "the motion of the fit")
         return
-    yield _error_remark(report, report.verification, "motion that it has not seen")
+    yield _error_remark(report, report.verification, "motion that the fit did not use")
     yield from _judge_growth(report)
 
 
@@ -228,9 +228,9 @@ def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> 
     if error > ERRORS.bad or worst_error > ERRORS.bad_joint:
         status = Status.BAD
     return Remark(
-        f"On {motion} the model misses {percent(error)} % of the RMS torque"
-        f"{logs[0].band_words}, of joint "
-        f"`{names[worst_joint]}` {percent(float(relative_errors[worst_joint]))} %",
+        f"The torque error on {motion} is {percent(error)} % "
+        f"(RMS{logs[0].band_words}); the largest is that of joint "
+        f"`{names[worst_joint]}`, {percent(float(relative_errors[worst_joint]))} %",
         status,
         f"Good: up to {100 * ERRORS.good:g} %; ! above {100 * ERRORS.doubtful:g} % "
         f"({100 * ERRORS.doubtful_joint:g} % of a joint), ✗ above "
@@ -259,9 +259,9 @@ def _judge_mass_matrix(definiteness: Definiteness) -> Remark:
         str(definiteness),
         Status.GOOD if definiteness.positive_definite else Status.BAD,
         f"Smallest eigenvalue over random poses: {eigenvalue} in SI units (Sec. 5). If "
-        "it is negative, do not simulate or control with this model where joints were "
-        'not moved: `kind = "consistent"` in `[estimator]` finds bodies that can '
-        "exist physically.",
+        "it is negative, do not simulate or control with this model in poses that the "
+        'logs do not cover: `kind = "consistent"` in `[estimator]` finds bodies that '
+        "can exist physically.",
     )
 
 
@@ -274,8 +274,8 @@ def _judge_bounds(fit: Fit) -> Iterator[Remark]:
     status = Status.GOOD if price <= PRICES.doubtful else Status.DOUBTFUL
     status = Status.BAD if price > PRICES.bad else status
     yield Remark(
-        f"All bodies are physically consistent, for {percent(price)} % larger "
-        f"residuals; active bounds: {active_bounds}",
+        "All bodies are physically consistent; this makes the residuals "
+        f"{percent(price)} % larger; active bounds: {active_bounds}",
         status,
         f"Good: up to {100 * PRICES.doubtful:g} %; tolerable: up to "
         f"{100 * PRICES.bad:g} %. Above that, the logs contradict the bounds: check "
@@ -314,9 +314,9 @@ def _judge_claims(claimed: Sequence[TorqueErrors]) -> Iterator[Remark]:
         if claim > MAX_CLAIM_RATIO * size > 0:
             ratio = significant(claim / size, 2)
             yield Remark(
-                f"The bodies of the robot's file need {ratio} times the forces of the "
-                "logs: are these currents "
-                "(`recording.torque_constants`), the motors' (`forces_side`) or in "
+                f"With the bodies in the robot's file, the motion would need {ratio} "
+                "times the forces of the logs: are the forces currents "
+                "(`recording.torque_constants`), motor torques (`forces_side`) or in "
                 "another unit (`force_unit`), or is the file wrong?",
                 Status.DOUBTFUL,
             )
@@ -335,9 +335,9 @@ def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:
         joints = f"joint{'s' if len(names) > 1 else ''} {', '.join(names)}"
         yield Remark(
             f"Friction of {joints} seems to have another shape: errors depend on "
-            "speed, and the intervals of these friction parameters do not hold; "
-            "`jaxid choose` tries other laws",
-            detail="Means over classes of speed agree between blocks of time.",
+            "speed, so the intervals of these friction parameters are too narrow; "
+            "`jaxid choose` tries other friction laws",
+            detail="The mean errors in ranges of speed agree between parts of the log.",
         )
 
 
@@ -353,9 +353,10 @@ def _remarks_on_fit(report: Report) -> Iterator[Remark]:
             f"The errors of {white_count} of {len(spectra.white)} joints are random "
             "(white noise)",
             detail="Where they are not, the model lacks a small effect. If the torque "
-            "errors matter to you, `jaxid choose` tries further effects; otherwise "
-            "nothing needs to be done: the intervals account for correlated errors. "
-            "Bartlett's test compares the cumulative spectrum with a straight line.",
+            "errors are too large for you, `jaxid choose` tries further "
+            "effects; otherwise you need not do anything: the intervals "
+            "account for correlated errors. Bartlett's test compares the "
+            "cumulative spectrum with a straight line.",
         )
     yield Remark(
         f"Estimates: {dict(fit.facts)['estimates']}",

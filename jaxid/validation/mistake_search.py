@@ -85,8 +85,8 @@ after these real logs had been seen.
 MAX_POWER_MISFIT = 0.04
 """Fraction (0 to 1) of the forces that a model may miss to tell the power."""
 EXCHANGED_COMMANDS = (
-    "the angles seem to be the commanded ones, and `recording.commands` the measured "
-    "ones: those are rougher, as encoders are, and explain the forces better."
+    "the columns of angles and of `recording.commands` seem to be exchanged: those of "
+    "`commands` are rougher, as measured angles are, and explain the forces better."
 )
 
 
@@ -121,9 +121,9 @@ class Mistakes(NamedTuple):
         if self.explained or self.unexplained or not delay.is_certain:
             return mistakes
         sentence = (
-            f"the forces of the log seem to be {delay} late, which mainly affects "
-            f"friction: `force_delay = {delay.seconds:.3g}` in `[recording]` "
-            "removes that."
+            f"the forces of the log seem to be {delay} late, which mainly affects the "
+            f"friction parameters: `force_delay = {delay.seconds:.3g}` in "
+            "`[recording]` removes that."
         )
         return mistakes._replace(doubts=(*self.doubts, sentence), possible=())
 
@@ -271,8 +271,8 @@ def _search(
     if is_single and _is_cure(equal_results[0], misfit):
         remaining_misfit = equal_results[0].misfit
         effect = (
-            f"the model then misses {100 * remaining_misfit:.2g} % of the forces "
-            f"instead of {100 * misfit:.2g} %."
+            f"the torque error is then {100 * remaining_misfit:.2g} % instead of "
+            f"{100 * misfit:.2g} %."
         )
         are_gains = all(x.is_gain for x in equal_results)
         return Mistakes(explained=(f"{texts}: {effect}",), are_gains=are_gains)
@@ -333,7 +333,8 @@ def _driving_text(described_log: DescribedLog, powers: np.ndarray) -> str:
     name = described_log.robot.joint_names[int(np.argmin(powers))]
     return (
         f"the sign of the force or angle of joint `{name}` seems to be wrong "
-        "(`recording.force_signs`, `angle_signs`): its friction would drive it."
+        "(`recording.force_signs`, `angle_signs`): with this sign, friction would "
+        "drive the joint."
     )
 
 
@@ -348,9 +349,9 @@ def _misfit_text(described_log: DescribedLog, fit: RowFit) -> str:
     joint = int(np.argmax(rows.relative_errors(fit.squares)))
     share = significant(100 * _misfit(fit, rows), 2)
     return (
-        f"the model does not fit: it misses {share} % of the forces, mainly those "
-        f"of joint `{described_log.robot.joint_names[joint]}`, and no single mistake "
-        "in signs, order, units, offsets, axes or gravity explains that."
+        f"the model does not fit: its torque error is {share} %, mainly at joint "
+        f"`{described_log.robot.joint_names[joint]}`, and no single mistake in signs, "
+        "order, units, offsets, axes or gravity explains it."
     )
 
 

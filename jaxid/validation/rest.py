@@ -34,7 +34,7 @@ def rest_remarks(described_log: DescribedLog) -> tuple[str, ...]:
     speeds = REST_SPEED * np.abs(described_log.log.motion.qd).max(axis=0)
     texts = ", ".join(f"{speed:.2g}" for speed in speeds)
     return (
-        f"friction at rest is not determined by the motion: on unseen parts of {names} "
+        f"the motion does not determine friction at rest: on unseen parts of {names} "
         f"the errors are up to {significant(100 * errors[worst_joint], 2)} % of the "
         f"forces, and {significant(100 * moving_errors[worst_joint], 2)} % without "
         f"rows at rest: leave these out by `min_speed = [{texts}]` in `[rows]`.",

@@ -103,8 +103,7 @@ def _wrap_text(x: np.ndarray, time: np.ndarray) -> str:
             count = "once" if jumps.size == 1 else f"{jumps.size} times"
             return (
                 f"jumps by a full turn ({turn:.4g}) {count}, first at "
-                f"{time[jumps[0] + 1]:.6g} s: undo the wrapping "
-                "(`recording.unwrap = true`)."
+                f"{time[jumps[0] + 1]:.6g} s: set `recording.unwrap = true`."
             )
     return ""
 

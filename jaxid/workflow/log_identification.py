@@ -229,12 +229,12 @@ def require_separate_logs(
     places = [os.path.realpath(log) for log in logs]
     for number, log in enumerate(logs):
         if places[number] in places[:number]:
-            raise InputError(f"`{log}` is given twice: its rows would count double.")
+            raise InputError(f"`{log}` is given twice: its rows would count twice.")
     shared_places = set(places) & {os.path.realpath(log) for log in verify}
     if shared_places:
         raise InputError(
-            f"`{Path(min(shared_places)).name}` is given both for the fit and "
-            "for verification: use `--split`, or `held_out` in Python."
+            f"`{Path(min(shared_places)).name}` is given both for the fit and for "
+            "validation: use `--split`, or `held_out` in Python."
         )
     if all(map(is_report, logs)):
         raise InputError(

@@ -189,7 +189,7 @@ def load_log(
         try:
             return _load_in_parts(setup, path, columns, progress, name)
         except NeedsMemory as reason:
-            notes = (f"{path.name} is long, but was read as a whole: {reason}",)
+            notes = (f"{path.name} is long, but had to be read as a whole: {reason}",)
 
     progress(f"reading {path.name}", 0.0)
     recording = read_log(setup, path, columns)
@@ -227,7 +227,7 @@ def _load_in_parts(
     step = comparison_step(observations)
     if step > 1:
         rows = f"one of every {step} of its {observations.rows} rows"
-        notes = (*notes, f"{observations.name}: torque errors and figures take {rows}")
+        notes = (*notes, f"{observations.name}: torque errors and figures use {rows}")
     return LoadedLog(observations.replace(notes=notes), diagnosis)
 
 

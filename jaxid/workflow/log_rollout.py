@@ -176,8 +176,8 @@ def _follow_torques(
 
     if setup.load_friction:
         raise InputError(
-            "`model.load` is for `jaxid identify`: simulations know no friction that "
-            "grows with torque. Leave it out."
+            "`model.load` is for `jaxid identify`: simulations do not include "
+            "friction that grows with torque. Leave the key out."
         )
     progress("finding base parameters", 0.0)
     base = setup.base

@@ -69,11 +69,13 @@ def check_floor(
     if has_floor and findings:
         return judge("floor", findings)
     if has_floor:
-        return Remark("floor: no shape of the robot can come near it", Status.GOOD)
+        return Remark("floor: no shape of the robot can reach it", Status.GOOD)
     if surroundings.collision.floor is False:
         text = "floor: not checked, because of `floor = false`"
         return Remark(text, Status.DOUBTFUL, unchecked="floor")
-    return Remark("floor: not checked, no shape of the robot is known", Status.BAD)
+    return Remark(
+        ("floor: not checked, since no shape of the robot is known"), Status.BAD
+    )
 
 
 def check_self_collision(
@@ -91,7 +93,7 @@ def check_self_collision(
         text = "self-collision: not checked, because of `fit = false`"
         yield Remark(text, Status.DOUBTFUL, unchecked="self-collision")
     elif not surroundings.faults:
-        yield Remark("self-collision: no two bodies can meet", Status.GOOD)
+        yield Remark("self-collision: no two bodies can touch", Status.GOOD)
 
 
 def judge(name: str, findings: Sequence[Finding]) -> Remark:
@@ -100,5 +102,5 @@ def judge(name: str, findings: Sequence[Finding]) -> Remark:
     keeps_limits = worst_finding.value <= 0
     verb = "keep their limits" if keeps_limits else "do not keep their limits"
     nearest_finding = str(worst_finding).removeprefix("the ")
-    text = f"{name}: {len(findings)} quantities {verb}; the nearest: {nearest_finding}"
+    text = f"{name}: {len(findings)} quantities {verb}; the closest: {nearest_finding}"
     return Remark(text, Status.GOOD if keeps_limits else Status.BAD)

@@ -174,8 +174,8 @@ def require_playable(setup: Setup, excitation: Excitation) -> None:
         CONTROLLERS[excitation.controller].require(setup.robot)
         if not excitation.rests:
             raise InputError(
-                "`controller` plays motions from standstill to standstill: leave "
-                "`leads = false` out, or set `rest = true`."
+                "`controller` needs a motion that starts and ends at rest: remove "
+                "`leads = false`, or set `rest = true`."
             )
 
 
@@ -366,9 +366,7 @@ def describe_nominal(task: MotionTask, nominal: Nominal) -> Iterator[Remark]:
         if np.isnan(value)
     ]
     if unknown_names:
-        text = (
-            f"not known, and counted as zero in the forces: {', '.join(unknown_names)}"
-        )
+        text = f"unknown, and taken as zero in the forces: {', '.join(unknown_names)}"
         if task.excitation.force_margin is None:
             text += (
                 f"; so {100 * UNKNOWN_SHARE:g} % of the largest "

@@ -78,8 +78,8 @@ def fit_runs(
     doubts = []
     if not has_plain_estimator(setup):
         doubts.append(
-            "all runs are weighted least squares here: "
-            "the rest of `[estimator]` is ignored"
+            "this command always uses weighted least squares: the rest of "
+            "`[estimator]` is ignored"
         )
     progress("finding base parameters", 0.0)
     paths = [path for group in groups.values() for path in group]
@@ -153,8 +153,8 @@ def fit_with_and_without_load(
     shared_places = set.intersection(*places)
     if shared_places:
         raise InputError(
-            f"`{Path(min(shared_places)).name}` is given "
-            "both without and with the load: name it once."
+            f"`{Path(min(shared_places)).name}` is given both as a log without and as "
+            "a log with the load: name it once."
         )
     return fit_runs(setup, groups, columns, progress)
 

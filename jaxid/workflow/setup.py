@@ -297,8 +297,8 @@ class Setup(eqx.Module):
             if change < LOAD_FRICTION_TOLERANCE * np.abs(coefficients).max():
                 return fit
         note = (
-            "friction by load has not settled in "
-            f"{MAX_LOAD_FRICTION_FITS} fits: its values are uncertain."
+            f"load-dependent friction has not converged in {MAX_LOAD_FRICTION_FITS} "
+            "fits: its values are uncertain."
         )
         return dataclasses.replace(fit, notes=(*fit.notes, note))
 

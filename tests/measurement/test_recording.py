@@ -19,7 +19,7 @@ def test_uniform_stamps_stay_as_they_are():
     assert r.sample_time == 0.01
     np.testing.assert_allclose(r.time, 0.01 * np.arange(100), atol=1e-12)
     np.testing.assert_array_equal(r.angles[:, 0], np.sin(3 * t))
-    assert r.notes == ("time counts from the first row, which was stamped 5 s",)
+    assert r.notes == ("time starts at zero at the first row, whose stamp was 5 s",)
 
 
 def test_repeated_stamps_are_removed_and_counted():

@@ -313,7 +313,7 @@ def test_weight_is_the_slope_of_the_potential_energy(fit):
             "body of joint swing_$1_$",
         ),
         ("D2", "product of inertia in y, z", "body of joint swing_$1_$"),
-        ("fo1", "constant offset: of the sensor, or of friction", "joint rail"),
+        ("fo1", "constant offset of the sensor or of friction", "joint rail"),
         ("sm2_1", "ripple: sine, 2 times a turn of the motor", "joint rail"),
         ("odd9", "effect of a model of your own", ""),
     ],

@@ -170,7 +170,7 @@ def test_the_verdict_follows_the_most_severe_finding(fit, validation):
     found = judge(Report(fit, (first,), (bad,), validation.definiteness))
     assert found.verdict.status is Status.BAD
     assert found.findings[0].status is Status.BAD
-    assert "has not seen" in found.findings[0].text
+    assert "the fit did not use" in found.findings[0].text
     marks = [finding.status for finding in found.findings]
     assert marks == sorted(marks, key=SEVERITIES.index)
     sick = dataclasses.replace(validation.definiteness, smallest=-1.0, indefinite=0.2)
@@ -206,7 +206,7 @@ def test_errors_on_new_motion_are_judged_by_their_share_of_the_forces(
     unexplained = predicted - np.asarray(second.measured)
     missed = dataclasses.replace(second, predicted=predicted, unexplained=unexplained)
     found = judge(Report(fit, (first,), (missed,), validation.definiteness))
-    (remark,) = (x for x in found.findings if "has not seen" in x.text)
+    (remark,) = (x for x in found.findings if "the fit did not use" in x.text)
     assert remark.status is status
     assert found.verdict.status is status
     percents = [float(x) for x in re.findall(r"([\d.]+) %", remark.text)]

@@ -352,7 +352,7 @@ def effects(**changes):
 def test_a_note_names_each_effect_that_no_term_describes(write, changes, sentence):
     *_, note = jid.load_mjcf(write(effects(**changes)), tip="lower").notes
     assert re.match(sentence, note)
-    assert "the default model leaves it out" in note
+    assert "the default model does not include it" in note
 
 
 @pytest.mark.parametrize("changes", NO_EFFECTS.values(), ids=NO_EFFECTS)

@@ -396,7 +396,7 @@ def chain_of_three(masses, moment):
     [
         ((4.0, 3.0, 1.5), 1e-2, ""),
         ((4000.0, 3.0, 1.5), 1e-2, "joint `j1`: .*is a mass in grams"),
-        ((4.0, 3.0, 0.02), 1e-6, "joints `j1`, `j2`: .* are moments placeholders"),
+        ((4.0, 3.0, 0.02), 1e-6, "joints `j1`, `j2`: .* are the moments placeholders"),
         ((4.0, 3.0, 1.5), 0.0, "joints `j1`, `j2`, `j3`: .* placeholders"),
     ],
 )

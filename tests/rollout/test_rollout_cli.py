@@ -97,7 +97,7 @@ contacts = { short_1 = [[4.0, 6.0]] }"""
     ]
     done = CliRunner().invoke(app, words, catch_exceptions=False)
     assert done.exit_code == 0, done.output
-    assert "not validated on an unseen log" in done.output
+    assert "not validated on another log" in done.output
     found = json.loads((folder / "known" / "rollout.json").read_text())
     assert found["verdict"][0]["status"] == "doubtful"
     assert found["simulators"]["stiffness"] == [12.0, 11.0]

@@ -245,7 +245,9 @@ def test_commands_in_place_of_measured_angles_are_named(motors):
     commanded, measured = logs
     mistakes = find_mistakes(BASE.model, [commanded], None, [measured])
     (sentence,) = mistakes.explained
-    assert sentence.startswith("the angles seem to be the commanded ones")
+    assert sentence.startswith(
+        "the columns of angles and of `recording.commands` seem to be exchanged"
+    )
     assert find_mistakes(BASE.model, [measured], None, [commanded]).explained == ()
 
 

@@ -150,7 +150,7 @@ class CoupledDrives(AbstractTerm):
         if not couplings:
             raise InputError(
                 f"the drives of `{robot.name}` are not coupled: leave `CoupledDrives` "
-                "out, or give `drives.reduction` entries beside its diagonal."
+                "out, or give `drives.reduction` entries off its diagonal."
             )
         return tuple(
             (f"{name}{i + 1}", unit_r if robot.revolute[i] else unit_p)
@@ -197,7 +197,7 @@ class ConstantOffset(AbstractTerm):
 
     joint_parameters = (
         JointParameter(
-            "fo", "constant offset: of the sensor, or of friction", ("N m", "N")
+            "fo", "constant offset of the sensor or of friction", ("N m", "N")
         ),
     )
 

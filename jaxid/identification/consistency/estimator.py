@@ -79,9 +79,9 @@ class Consistency(eqx.Module):
         if self.masses_from_bounds:
             names = ", ".join(f"m{k + 1}" for k in self.masses_from_bounds)
             sentences.append(
-                f"forces do not determine the masses {names} alone: "
-                "their values, and parameters that depend on them, "
-                "reflect the bounds; base parameters and forces do not."
+                f"forces alone do not determine the masses {names}: their values, and "
+                "parameters that depend on them, reflect the bounds; base parameters "
+                "and forces do not."
             )
         if self.active:
             sentences.append(f"active bounds: {'; '.join(self.active)}.")
@@ -99,8 +99,9 @@ class Consistency(eqx.Module):
         if not self.certified:
             sentences.append(
                 "the squared residuals may exceed the smallest possible ones by "
-                f"{self.error_bound:.1e} of them; at most {2 * solver.TOLERANCE:.0e} "
-                "is a proof of the optimum: widen the bounds."
+                f"{self.error_bound:.1e} of them; only up to "
+                f"{2 * solver.TOLERANCE:.0e} counts as proof of the optimum: widen the "
+                "bounds."
             )
         return tuple(sentences)
 
@@ -271,7 +272,7 @@ def _active_bounds(
 
     is_flat = consistency_margin(bodies) < MAX_FLAT_MARGIN
     if is_flat.any():
-        sentences.append(f"body {numbers(is_flat)} as flat as a body can be")
+        sentences.append(f"body {numbers(is_flat)} as flat as a physical body can be")
     return tuple(sentences)
 
 

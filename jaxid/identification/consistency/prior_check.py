@@ -69,8 +69,8 @@ def choose_pull(
     ball_square, *squares = _unseen_squares(rows, weights, solve, [balls, *pulls])
     if min(squares) > MAX_GROWTH * ball_square:
         note = (
-            "the bodies of the robot's file are not used as a prior: "
-            "with them the model predicts unseen parts of the logs worse."
+            "the bodies of the robot's file are not used as a prior: with them, "
+            "predictions of unseen parts of the logs are worse."
         )
         return ChosenPull(balls, (note,))
     return ChosenPull(pulls[int(np.argmin(squares))], ())

@@ -111,7 +111,7 @@ def select_shapes(base: BaseParameters, names: Sequence[str] = ()) -> Shapes:
     # Columns with memory depend on the path, so no sample can be evaluated alone.
     if base.model.memory is not None:
         raise InputError(
-            "shapes are not searched for beside `Presliding`: take `Tanh`."
+            "shapes cannot be identified together with `Presliding`: use `Tanh`."
         )
     kinds = []
     for number, term in enumerate(base.model.terms):

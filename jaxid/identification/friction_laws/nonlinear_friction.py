@@ -57,7 +57,7 @@ class HeldOutErrors(eqx.Module):
         return self.gain > max(2.0 * self.gain_deviation, MIN_GAIN)
 
     def __str__(self):
-        verdict = "pays" if self.pays else "does not pay"
+        verdict = "pays" if self.pays else "is not worth its parameters"
         return (
             f"nonlinear friction {verdict}: on held-out blocks of time its error is "
             f"{100 * self.nonlinear:.2f} % of the forces, that of the linear model "

@@ -89,9 +89,11 @@ def with_friction_near_rest(
         parameter = problem.base.names[int(np.argmax(ratios))]
         note = (
             f"rows slower than {100 * LIMITS.speed:g} % of the top speed of a joint "
-            "disagree with the others, as where joints stick: intervals include it and "
-            f"are up to {significant(ratios.max(), 2)} times as wide as without it, "
-            f"most that of `{parameter}`; leave slow rows out (`rows.min_speed`)."
+            "disagree with the other rows, which is typical of joints that stick. The "
+            "intervals include this difference and are up to "
+            f"{significant(ratios.max(), 2)} times as wide as without it, with the "
+            f"largest change for `{parameter}`; leave slow rows out "
+            "(`rows.min_speed`)."
         )
         notes = (*notes, note)
     return dataclasses.replace(errors, covariance=covariance, notes=notes)

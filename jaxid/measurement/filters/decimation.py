@@ -92,8 +92,8 @@ class Subsample(AbstractDecimation):
         max_step = max(1, math.floor(0.5 / (cutoff * sample_time)))
         raise InputError(
             f"`Subsample({self.step})` leaves {rate:.6g} Hz, but a cut-off of "
-            f"{cutoff:.6g} Hz needs more than {2 * cutoff:.6g} Hz: take one of "
-            f"{max_step} samples at most, a lower cut-off, or `Decimation`."
+            f"{cutoff:.6g} Hz needs more than {2 * cutoff:.6g} Hz: use a step of at "
+            f"most {max_step} samples, a lower cut-off, or `Decimation`."
         )
 
 
@@ -119,7 +119,7 @@ class Decimation(AbstractDecimation):
         if not self.factors or not is_valid:
             raise InputError(
                 f"`factors` must be from 1 to {MAX_FACTOR} each, but are "
-                f"{self.factors}: take several stages."
+                f"{self.factors}: use several stages."
             )
 
     @property

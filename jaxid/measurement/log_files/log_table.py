@@ -53,7 +53,7 @@ def readable(source: str, kind: str) -> Iterator[None]:
         text, *_ = re.split(r"[{^]", " ".join(str(error).split()))
         reason = text[:200].rstrip(" .:;,(") or "its parts contradict each other"
         if isinstance(error, MemoryError):
-            reason = "it declares more data than the memory can hold"
+            reason = "it declares more data than fit into memory"
         elif isinstance(error, UnicodeDecodeError):
             reason = "it holds bytes that are not text"
         raise InputError(
@@ -68,8 +68,8 @@ def refuse_inflation(path: Path, sizes: Mapping[str, int]) -> None:
         name = max(sizes, key=lambda name: sizes[name])
         raise InputError(
             f"`{name}` of `{path.name}` needs {sizes[name]:.3g} bytes of memory, but "
-            f"the whole file has {file_size}: save it again with the samples that "
-            "were recorded only, or without compression."
+            f"the whole file has {file_size}: save it again with the recorded samples "
+            "only, or without compression."
         )
 
 
@@ -232,8 +232,8 @@ class LogTable:
                 self.bad_rows[number] = text
         elif len(rows) > MIN_SPARSE_SHARE * len(is_bad):
             raise NeedsMemory(
-                f"many cells of `{name}` of `{self.source}` hold no number, as in "
-                "merged tables, which `read_recording` reads."
+                f"many cells of `{name}` of `{self.source}` hold no number. If this is "
+                "a merged table, read it with `read_recording`."
             )
         elif rows:
             number = rows[0] + self.first_row
