@@ -30,6 +30,8 @@ PADDING = 2
 """Blanks between two columns."""
 MIN_TEXT_WIDTH = 12
 """Characters of a line to which a column of texts may be folded."""
+MAX_NAME_WIDTH = 24
+"""Characters of a line from which on names are folded, at their underscores."""
 UNSEEN_CHARACTERS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
 )
@@ -168,7 +170,8 @@ def with_deviation(value: float, deviation: float) -> tuple[str, str]:
     if decimals not in SHORT_DECIMALS:
         return significant(value, 5), significant(deviation, 2)
     digits = max(decimals, 0)
-    return f"{value:.{digits}f}", f"{deviation:.{digits}f}"
+    # Rounded to zero, a negative number has no sign.
+    return f"{value:z.{digits}f}", f"{deviation:.{digits}f}"
 
 
 def with_deviations(values: Any, deviations: Any) -> tuple[list[str], list[str]]:
@@ -220,9 +223,17 @@ class Column:
 
     @property
     def min_width(self) -> int:
-        """Characters of a line that the column needs; texts are folded, not numbers."""
-        width = max(map(len, (*self.header, *self.texts)))
-        return width if self.kind == "number" else min(width, MIN_TEXT_WIDTH)
+        """Characters of a line that the column needs; only texts can be folded."""
+        if self.kind == "number":
+            return self.width
+        parts = fold_names(" ".join((*self.header, *self.texts))).split()
+        longest_part = max(map(len, parts), default=0)
+        return max(longest_part, min(self.width, MIN_TEXT_WIDTH))
+
+    @property
+    def width(self) -> int:
+        """Characters of a line that the column takes if nothing is folded."""
+        return max(map(len, (*self.header, *self.texts)))
 
     @property
     def texts(self) -> list[str]:
@@ -240,6 +251,21 @@ class Column:
             text + " " * (width - length)
             for text, length in zip(texts, lengths, strict=True)
         ]
+
+
+def fold_names(text: str) -> str:
+    """Return a text with line breaks behind underscores of long names."""
+    return re.sub(
+        rf"(?=\S{{{MAX_NAME_WIDTH + 1}}})(\S{{1,{MAX_NAME_WIDTH - 1}}}_)", r"\1\n", text
+    )
+
+
+def unit_columns(name: str, units: Iterable[str]) -> tuple[str, list[Column]]:
+    """Return the unit of all rows; if they differ, `name` and a column of that name."""
+    column = Column(name, tuple(units))
+    if len(set(column.values)) == 1:
+        return column.values[0], []
+    return name, [column]
 
 
 def estimate_columns(
@@ -376,18 +402,33 @@ class Table:
             yield part
 
     def _blocks(self, max_width: int) -> list[list[Column]]:
-        """Return columns in groups that fit a width, each begins with the first one."""
-        first_column, *columns = self.columns
-        blocks = [[first_column]]
-        for column in columns:
+        """Return columns in groups that fit a width; each begins with the names."""
+        # Numbers of rows are not names: the names after them are repeated, too.
+        kinds = [column.kind == "number" for column in self.columns[:2]]
+        keys = self.columns[: 2 if kinds == [True, False] else 1]
+        blocks = [list(keys)]
+        for column in self.columns[len(keys) :]:
             block = [*blocks[-1], column]
-            width = 1 + PADDING if self.status else 0
-            width += sum(x.min_width + PADDING for x in block) - PADDING
-            if width > max_width and len(block) > 2:
-                blocks.append([first_column, column])
+            width = self._mark_width + sum(x.min_width + PADDING for x in block)
+            if width - PADDING > max_width and len(block) > len(keys) + 1:
+                blocks.append([*keys, column])
             else:
                 blocks[-1] = block
         return blocks
+
+    @property
+    def _mark_width(self) -> int:
+        """Characters of a line that the marks take."""
+        return 1 + PADDING if self.status else 0
+
+    def _widths(self, columns: Sequence[Column], max_width: int) -> list[int]:
+        """Return the widths of columns; those of texts share the space that is left."""
+        min_widths = [column.min_width for column in columns]
+        space = max_width - self._mark_width - sum(min_widths)
+        space -= PADDING * (len(columns) - 1)
+        texts = [column for column in columns if column.width > column.min_width]
+        share = max(space, 0) // max(len(texts), 1)
+        return [min(column.width, column.min_width + share) for column in columns]
 
     def _grid(self, columns: Sequence[Column], max_width: int) -> Any:
         """Return marks and columns as a table of `rich`, which folds texts to fit."""
@@ -397,25 +438,24 @@ class Table:
 
         grid = Grid(box=None, padding=(0, PADDING, 0, 0), pad_edge=False)
         if self.status:
-            grid.add_column(min_width=1)
+            grid.add_column(width=1)
         cells = []
-        for column in columns:
+        widths = self._widths(columns, max_width)
+        for column, width in zip(columns, widths, strict=True):
             texts = column.texts
             header = Text("\n".join(column.header), "bold")
             if column.kind == "number":
                 header.justify = "right"
                 # Blanks before a number, not its justification, which would take
                 # those behind it away.
-                texts = [text.rjust(column.min_width) for text in texts]
-                grid.add_column(header, min_width=column.min_width, no_wrap=True)
-            else:
-                grid.add_column(header, min_width=column.min_width, overflow="fold")
+                texts = [text.rjust(width) for text in texts]
+            elif width < column.width:
+                texts = [fold_names(text) for text in texts]
+            grid.add_column(header, width=width, overflow="fold")
             cells.append(map(Text, texts))
 
         # Even these few columns may be wider than the terminal: nothing is cut then.
-        widths = [(column.min_width or 0) + PADDING for column in grid.columns]
-        if sum(widths) - PADDING > max_width:
-            grid.width = sum(widths) - PADDING
+        grid.width = self._mark_width + sum(widths) + PADDING * (len(widths) - 1)
         for k, row in enumerate(zip(*cells, strict=True)):
             if k in self.rules:
                 grid.add_row(*[Rule(style="dim")] * len(grid.columns))

@@ -87,7 +87,7 @@ def design_excitation(
             those; the robot's if None. Unknown limits are assumed as in
             `random_fourier_series`.
         harmonics: Number of harmonics of the Fourier series.
-        omega: Ground frequency of the series [rad/s].
+        omega: Fundamental frequency of the series [rad/s].
         basis: Family of trajectories in place of Fourier series: for instance
             `RestToRestBasis`.
         criterion: Criterion to be minimised; D-optimality if None.

@@ -92,14 +92,14 @@ def known_load(
 
 @dataclasses.dataclass(frozen=True)
 class RobotSource:
-    """Place of a robot, and its source: `urdf`, `mjcf` or `builtin` is needed.
+    """Source and place of the robot; `urdf`, `mjcf` or `builtin` is needed.
 
     Attributes:
-        urdf: Path of a URDF or xacro file, as seen from the folder of this file.
+        urdf: Path of a URDF or xacro file, relative to the folder of this file.
         mjcf: Path of an MJCF file, which MuJoCo compiles, like `"arm.xml"`.
         tip: Link (body or site) of the end-effector in the URDF (MJCF) file: only the
             chain from `base` to it is used, like `"flange"`.
-        base: Link (body) of that file that stands on the ground, like `"base_link"`.
+        base: Link (body) of that file that is fixed to the ground, like `"base_link"`.
         xacro_arguments: Arguments with which a xacro file is expanded, like
             `{ dof = "6" }`.
         builtin: Name of a robot that jaxid knows, like `"tx40"`: tx90l_on_rail, tx40,
@@ -111,8 +111,8 @@ class RobotSource:
         base_rotation: Orientation of the robot on level ground: roll, pitch, yaw [deg];
             by default as the robot's file places `base`, like `[0.0, 0.0, 0.0]`.
         base_position: Position of the robot on the ground [m], like `[0.0, 0.0, 0.0]`.
-        snap_tolerance: Angle [rad] up to which the robot's axes are taken for parallel
-            or perpendicular, like `1e-3` for a file with 1.571 instead of pi/2.
+        snap_tolerance: Largest deviation [rad] at which axes still count as parallel or
+            perpendicular, like `1e-3` for a file with 1.571 instead of pi/2.
         tool: Known load at the end-effector, whose forces are subtracted.
     """
 

@@ -46,13 +46,13 @@ class DryFriction:
     Attributes:
         epsilon: Speed of the smooth transition [rad/s or m/s], like `0.01`; or a list;
             by default it is found from the logs, for each joint.
-        hard: Whether to take a sign instead of tanh(speed / epsilon).
-        asymmetric: Whether each direction has a level of its own (then there is no
-            `offset`).
-        presliding: Whether friction has memory: it builds up along a path, whose length
-            is found from the logs, and rest keeps it.
-        stribeck: Speed about which friction falls from a static level [rad/s or m/s],
-            like `0.1`; or a list.
+        hard: Whether to use a sign function instead of tanh(speed / epsilon).
+        asymmetric: Whether friction has its own level in each direction (then there is
+            no `offset`).
+        presliding: Whether friction has memory: it builds up over a distance, which is
+            found from the logs, and remains at rest.
+        stribeck: Speed around which friction falls from its static level [rad/s or
+            m/s], like `0.1`; or a list.
     """
 
     epsilon: float | list[float] | None = None
@@ -119,19 +119,19 @@ SWITCHES = {name: term for name, term in terms.TERMS.items() if term.is_switch}
 
 @dataclasses.dataclass(frozen=True)
 class AbstractEffects:
-    """Effects that the model has beside the rigid bodies.
+    """Effects in the model in addition to rigid bodies.
 
     Attributes:
         principal_axes: Whether to leave out products of inertia (seven per body, Eq.
             12).
-        viscous: Whether friction grows with speed; "asymmetric": at one rate for each
-            direction.
-        load: Whether dry friction grows with the weight on a joint, too; the bodies are
-            those that are identified, until both agree.
+        viscous: Whether friction grows with speed; "asymmetric": with another rate in
+            each direction.
+        load: Whether dry friction also grows with the load on a joint; the load comes
+            from the identified bodies, and the fit is repeated until both agree.
         motor_ripple: Multiples of the motors' turns at which their torques ripple, like
             `[1, 2]`.
         joint_ripple: Multiples of the joints' turns at which forces ripple, like `[1]`.
-        rotor_inertia: Whether the motors' rotors are felt through the gears.
+        rotor_inertia: Whether the inertia of the motors' rotors acts through the gears.
         offset: Whether there is a constant force at each joint (sensor offsets); by
             default unless dry friction is asymmetric.
         coulomb: Dry friction, as a table; or none, like `false`.
@@ -201,8 +201,8 @@ class Sides:
     """Sides of the gears on which the logs are.
 
     Attributes:
-        side: Side of the gears on which the log is: "joint" or "motor".
-        forces_side: Side of the forces, if it is another one, like `"motor"`.
+        side: Side of the gears on which the log was recorded: "joint" or "motor".
+        forces_side: Side of the forces, if it differs from `side`, like `"motor"`.
     """
 
     side: Side = "joint"
@@ -300,8 +300,8 @@ def build_rows(
 
     Args:
         robot: Robot with the joints.
-        step: Number of samples from one row to the next, of signals below half of that
-            rate.
+        step: Number of samples from one row to the next; the filter must remove
+            frequencies above half of the resulting rate.
         factors: Factors of stages that low-pass and decimate, instead of `step`, like
             `[10, 10]`: 13 at most.
         min_speed: Speed below which rows do not count [rad/s or m/s], like `0.05`; or a
@@ -393,21 +393,21 @@ def build_estimation(
         robot: The robot.
         robot_file: File of the robot, whose bodies are the prior of consistent ones.
         bounds: Bounds of bodies, in place of those from the robot's geometry.
-        kind: "consistent": weighted least squares over bodies that can exist;
-            "weighted": without that; "least_squares": every newton metre counts the
-            same; "huber", "tukey": rows that the model cannot explain count less, or
-            not at all. Without it, what the other keys belong to.
+        kind: "consistent": weighted least squares over physically possible bodies;
+            "weighted": without that condition; "least_squares": every newton metre
+            counts the same; "huber", "tukey": rows that the model cannot explain count
+            less, or not at all. By default, the kind that the other keys belong to.
         weights: Weights of the joints: "maximum_forces" (Eq. 30), the default where
-            they are known; or "residual_variances": what the model leaves unexplained.
+            they are known; or "residual_variances": from the errors of the model.
         ridge: Strength of a pull of undetermined combinations towards zero, relative to
             the best-determined one, like `"cross_validated"`: as much as predicts
             left-out parts of the logs best; or a number like 0.01.
         uncertainty: Method of the standard deviations: "spectral"; "jackknife": from
-            blocks of time left out in turn; "independent": as if rows were independent,
-            far too small.
+            blocks of time left out in turn; "independent": as if rows were independent
+            (far too small).
         pull: Strength of a pull towards the bodies of the robot's file, or towards
-            balls if those cannot exist ("consistent"), like `1.0`; 0 for none. Without
-            it, blocks of the logs choose the strength.
+            balls if those are impossible ("consistent"), like `1.0`; 0 for none. By
+            default, the strength that predicts left-out parts of the logs best.
 
     Raises:
         InputError: If keys do not go together, or a file cannot be read.

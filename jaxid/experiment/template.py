@@ -37,13 +37,13 @@ COLUMN = 38
 """Column in which the comments behind keys begin."""
 HEAD = """\
 # Experiment file of {name}:
-# what is known of the robot, what its logs hold, how it is identified.
+# what is known of the robot, what its logs contain, and how it is identified.
 # Lines that begin with `#` are comments; remove the `#` before a key to use it.
 # Units: rad, m, s, N m (revolute joints) or N (prismatic joints), unless a key says \
 otherwise.
 #
 #   jaxid inspect  experiment.toml                      what can be identified
-#   jaxid inspect  experiment.toml log.csv              is this log sane?
+#   jaxid inspect  experiment.toml log.csv              does this log have mistakes?
 #   jaxid excite   experiment.toml -o trajectory.csv    the motion to record
 #   jaxid identify experiment.toml log.csv -o report/   parameters and torque errors
 """
@@ -54,7 +54,7 @@ SUMMARIES = {
     "load": "Known load that the robot carries in some logs only: `jaxid gains` finds "
     "the true forces.",
     "recording": f"Columns of the logs ({', '.join(READERS)}). "
-    'A pattern ("{}" stands for the joint\'s number, "{name}" for its name), '
+    'A pattern ("{}" is the number of the joint, "{name}" its name), '
     "a list of names, or positions from 0.",
 }
 """Descriptions of tables where the docstring of their function says something else."""

@@ -277,7 +277,8 @@ def compare_some(
 
 
 def _with_sign(numbers: Sequence[str]):
-    return [x if x.startswith("-") else f"+{x}" for x in numbers]
+    """Return numbers with their signs, except those that are rounded to zero."""
+    return [f"+{x}" if x[0] != "-" and float(x) else x for x in numbers]
 
 
 def _status(has_changed: bool) -> Status:

@@ -45,10 +45,10 @@ Channels = tuple[Matrix, Matrix | None, Matrix]
 class Columns:
     """Columns of a log that hold the time, the angles and the forces of a robot.
 
-    A group of columns is a tuple of names, a pattern such as `"q{}"` (`{}` stands for
-    the joints' numbers, from 1 or from 0), a tuple of positions from 0 (files without a
-    header), or one name: that of the column of a single joint, or of a whole array
-    (samples x joints), whose columns are `"q[{}]"`. Fields of bags are
+    A group of columns is a tuple of names, a pattern such as `"q{}"` (`{}` is the
+    number of the joint, counted from 1 or from 0), a tuple of positions from 0 (files
+    without a header), or one name: that of the column of a single joint, or of a whole
+    array (samples x joints), whose columns are `"q[{}]"`. Fields of bags are
     `"/topic.field[{}]"`, or `"/topic.field.joint"` by names.
 
     Angles become `sign * rated angle * unit * value + offset`, velocities
@@ -58,8 +58,8 @@ class Columns:
     force [N m or N] of a one in the log, like `0.00153` for counts of an encoder.
 
     Attributes:
-        angles: Joint or motor angles; `{}` stands for the joints' numbers, from 1 or
-            from 0.
+        angles: Joint or motor angles; `{}` is the number of the joint, counted from 1
+            or from 0.
         forces: Joint forces, motor torques or motor currents.
         velocities: Measured velocities, on the same side as the angles, like `"dq{}"`;
             None if there are none.
@@ -67,27 +67,27 @@ class Columns:
             `sample_time`, or the clock of bags and LeRobot data sets, if None.
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
         time_unit: Unit of the stamps.
-        angle_unit: Unit of the angles; or the angle of a one in the log [rad or m], as
-            a number such as 0.00153 for the counts of an encoder; "%" and "‰" need
-            `rated_angles`.
+        angle_unit: Unit of the angles; or the angle for a value of 1 in the log [rad or
+            m], as a number such as 0.00153 for the counts of an encoder; "%" and "‰"
+            need `rated_angles`.
         velocity_unit: Unit of the velocities, like `"rad/s"`; the angles' unit per
             second if None.
-        force_unit: Unit of the forces, or the force of a one in the log [N m or N];
-            currents need `torque_constants`, "%" and "‰" need `rated_forces`.
+        force_unit: Unit of the forces, or the force for a value of 1 in the log [N m or
+            N]; currents need `torque_constants`, "%" and "‰" need `rated_forces`.
         torque_constants: Torque of each motor for its current [N m/A].
-        rated_angles: Angle of each joint at 100 % less that at 0 % [rad or m].
+        rated_angles: Angle of each joint at 100 % minus that at 0 % [rad or m].
         rated_velocities: Velocity of each joint at 100 % [rad/s or m/s].
-        rated_forces: Rated force of each drive, of which the log holds "%" or "‰" [N m
-            or N; A with `torque_constants`].
+        rated_forces: Rated force of each drive, to which "%" or "‰" in the log refer [N
+            m or N; A with `torque_constants`].
         angle_signs: +1 or -1 for each joint, for the angles and velocities.
         force_signs: +1 or -1 for each joint.
         angle_offsets: Offsets that are added to the angles [rad or m], like `0.0`.
-        force_gains: Ratio of the true forces to those of the log, as a known load
-            tells.
+        force_gains: Ratio of the true forces to those of the log, as found with a known
+            load.
         angles_on_motor_side: Whether angles and velocities are the motors', before the
             gears.
         forces_on_motor_side: Whether forces are the motors', before the gears.
-        unwrap: Whether angles jump by full turns, which is undone.
+        unwrap: Whether to remove jumps of the angles by full turns.
         joint_names: Names of the robot's joints: arrays of bags are read by them, if
             the messages name their elements so; by place if None.
     """

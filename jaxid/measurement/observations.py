@@ -452,8 +452,7 @@ def prepare(
         j = slow_joints[0]
         raise InputError(
             f"joint `{robot.joint_names[j]}` never reaches the speed {speeds[j]:g} of "
-            f"`min_speed` in `{name}`: use a smaller value, or a log in which the "
-            "joint moves."
+            f"`min_speed` in `{name}`: use a smaller one, or a log in which it moves."
         )
     return observations.replace(mask=mask)
 

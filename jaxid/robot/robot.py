@@ -19,7 +19,7 @@ from jaxid.arrays import (
     namespace,
 )
 from jaxid.errors import InputError
-from jaxid.result_table import Column, Remark, Status, Summarised, Table
+from jaxid.result_table import Column, Remark, Status, Summarised, Table, unit_columns
 
 from .follower_joints import Followers, order_from_ground
 from .inertia import IMPOSSIBLE, Inertia
@@ -334,9 +334,7 @@ class Robot(Summarised, eqx.Module):
         )
 
     def mounted(
-        self,
-        rotation: Numbers | None = None,
-        position: Numbers = (0.0, 0.0, 0.0),
+        self, rotation: Numbers | None = None, position: Numbers = (0.0, 0.0, 0.0)
     ) -> "Robot":
         """Return the robot on a base that is tilted and shifted in the same gravity.
 
@@ -391,9 +389,7 @@ class Robot(Summarised, eqx.Module):
         )
         load = placed_tool.body_inertia.moved(self.tip_rotation, self.tip_offset)
         tool = dataclasses.replace(
-            placed_tool,
-            centre_of_mass=load.centre,
-            inertia=load.tensor,
+            placed_tool, centre_of_mass=load.centre, inertia=load.tensor
         )
         return self.replace(tool=tool)
 
@@ -410,15 +406,18 @@ class Robot(Summarised, eqx.Module):
         """Notes, of which those on bodies that nobody can have built are doubts."""
         remarks = []
         for note in self.notes:
-            is_doubt = IMPOSSIBLE in note
-            status = Status.DOUBTFUL if is_doubt else Status.NEUTRAL
+            status = Status.DOUBTFUL if IMPOSSIBLE in note else Status.NEUTRAL
             remarks.append(Remark(note, status))
         return remarks
 
     def summary(self) -> Table:
         """Return a table of the joints: parents, ranges, speeds and largest forces."""
         names = ("ground", *self.body_names)
-        units = [self.joint_unit(j) for j in range(self.joints)]
+        joints = range(self.joints)
+        unit, units = unit_columns("unit", map(self.joint_unit, joints))
+        force_unit, force_units = unit_columns(
+            "force unit", map(self.force_unit, joints)
+        )
         limits = self.limits
         tip_carrier = self.body_names[self.tip_body]
         facts = [("end-effector", f"on the body of `{tip_carrier}`")]
@@ -432,13 +431,13 @@ class Robot(Summarised, eqx.Module):
             f"{self.name}: {self.joints} joints",
             Column("joint", self.joint_names),
             Column("parent", [names[p + 1] for p in self.parent[: self.joints]]),
-            Column("unit", units),
-            Column("from", np.asarray(limits.position_min)),
-            Column("to", np.asarray(limits.position_max)),
-            Column("speed\nper s", np.asarray(limits.velocity)),
-            Column("accel.\nper s²", np.asarray(limits.acceleration)),
-            Column("force", self.known_max_forces),
-            Column("", [self.force_unit(j) for j in range(self.joints)]),
+            *units,
+            Column("from", np.asarray(limits.position_min), unit),
+            Column("to", np.asarray(limits.position_max), unit),
+            Column("speed", np.asarray(limits.velocity), f"{unit}/s"),
+            Column("acceleration", np.asarray(limits.acceleration), f"{unit}/s²"),
+            *force_units,
+            Column("force", self.known_max_forces, force_unit),
             facts=facts,
             remarks=self.remarks,
         )

@@ -83,8 +83,9 @@ def identify_rollout(
             s/rad or N s/m].
         feed_forward: Known gains of the command's velocity; likewise.
         alike: Words in the names of joints of one kind, like `[["hip"], ["knee"]]`:
-            they are equal as far as the logs do not differ. If None, joints whose names
-            differ only in a side are of one kind, like `left_hip` and `right_hip`.
+            they get similar parameters unless the logs contradict. If None, joints
+            whose names differ only in a side are of one kind, like `left_hip` and
+            `right_hip`.
         contacts: Starts and ends of the times in which something holds the robot, like
             `[(6.5, 64.7)]`, by the clock of the logs; of all logs, or by the name of
             the log. These samples do not count [s].

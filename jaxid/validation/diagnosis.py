@@ -22,6 +22,7 @@ from jaxid.result_table import (
     Summarised,
     Table,
     significant,
+    unit_columns,
 )
 from jaxid.robot.robot import Robot
 
@@ -86,21 +87,29 @@ class Diagnosis(Summarised):
         limits = robot.limits
         gaps = len(log.segments) - 1
         joints = range(robot.joints)
+        unit, units = unit_columns("unit", map(robot.joint_unit, joints))
+        force_unit, force_units = unit_columns(
+            "force unit", map(robot.force_unit, joints)
+        )
         return Table(
             f"log {log.name} (limits of the robot in brackets)",
             Column("joint", robot.joint_names),
-            _column_with_limits("from", statistics.lowest, limits.position_min),
-            _column_with_limits("to", statistics.highest, limits.position_max),
-            _column_with_limits("speed", statistics.speed, limits.velocity, "unit/s"),
-            _column_with_limits("force", statistics.force, robot.known_max_forces),
+            *units,
+            _column_with_limits("from", statistics.lowest, limits.position_min, unit),
+            _column_with_limits("to", statistics.highest, limits.position_max, unit),
+            _column_with_limits(
+                "speed", statistics.speed, limits.velocity, f"{unit}/s"
+            ),
+            *force_units,
+            _column_with_limits(
+                "force", statistics.force, robot.known_max_forces, force_unit
+            ),
             Column(
                 "at rest",
                 statistics.stands.mean(axis=0),
                 "%",
                 lambda x: f"{100 * x:.0f}",
             ),
-            Column("unit", [robot.joint_unit(j) for j in joints]),
-            Column("force\nunit", [robot.force_unit(j) for j in joints]),
             facts=[
                 (
                     "samples",
@@ -125,7 +134,7 @@ class Diagnosis(Summarised):
 
 
 def _column_with_limits(
-    name: str, values: np.ndarray, limits: AnyArray, unit: str = ""
+    name: str, values: np.ndarray, limits: AnyArray, unit: str
 ) -> Column:
     """Return a column of values with limits in brackets."""
     pairs = zip(values.tolist(), np.asarray(limits).tolist(), strict=True)

@@ -35,34 +35,34 @@ class Excitation:
     """Motion that `jaxid excite` designs, within the limits above.
 
     Attributes:
-        criterion: Objective: "d_optimal" for the smallest standard deviations on the
-            whole, "condition_number" for the paper's (Eq. 36), or another criterion.
+        criterion: Objective: "d_optimal" for the smallest standard deviations overall,
+            "condition_number" for the paper's (Eq. 36), or another criterion.
         harmonics: Number of harmonics of the Fourier series.
-        omega: Ground frequency of the series [rad/s].
+        omega: Fundamental frequency of the series [rad/s].
         rest: Whether the motion starts and stops at rest.
         spline: Spline from rest to rest in place of a series, like
             `{ points = 12, duration = 8.0 }`.
-        leads: Way from standstill into the periodic motion, and out; or a table, like
-            `{ time = 0.5, periods = 2 }`: of so many seconds, designed together with
-            the motion, and two periods between them.
+        leads: Whether leads bring the robot from standstill into the periodic motion
+            and back; or a table, like `{ time = 0.5, periods = 2 }`: their duration
+            (they are then designed together with the motion) and the number of periods
+            between them.
         samples: Number of samples that one run will measure.
         noise: Standard deviation of the forces' noise for each joint [N m or N]; by
             default 1 % of the largest forces.
         starts: Number of random motions to start from.
-        generations: Number of times that the motions found have children.
-        time: Time for the search [s], like `60.0`; by default all of its steps are
-            done.
+        generations: Number of rounds in which the best motions are recombined.
+        time: Time for the search [s], like `60.0`; by default, all steps are done.
         seed: Seed of the random motions.
         sample_time: Time between two rows of the written table, the controller's cycle
             [s], like `0.004`; by default that of the controller, or of the samples.
         controller: Controller that plays the motion, for its cycle and its file:
             franka, kuka_fri, kuka_rsi or universal_robots, like `"universal_robots"`.
         ros: Kind of the file for ROS 2: "yaml" or "mcap" (a bag).
-        nominal: Folder of an earlier result of `jaxid identify`, whose parameters tell
-            the forces, like `"report"`.
-        force_margin: float of the largest forces to keep free, by nominal
-            parameters, like `0.1`; by default 0.3 if friction or others are unknown,
-            else 0.
+        nominal: Folder of an earlier result of `jaxid identify`, whose parameters are
+            used to compute forces, like `"report"`.
+        force_margin: float of the largest forces to keep free, by nominal parameters,
+            like `0.1`; by default 0.3 if friction or other parameters are unknown, else
+            0.
         tip_speed: Largest speed of the end-effector [m/s], like `1.5`.
         tip_acceleration: Largest acceleration of the end-effector [m/s²], like `10.0`.
         workspace: Box for the end-effector: two corners [m], like

@@ -29,20 +29,20 @@ class ServoSettings:
     """Settings of `jaxid rollout`: for logs of commands, without torques.
 
     Attributes:
-        bodies: Whether the bodies of the robot's file load the joints; by default if it
-            has some.
+        bodies: Whether the bodies of the robot's file load the joints; by default, if
+            the file has any.
         stiffness: Stiffness (proportional gain) of the servos if it is known [N m/rad
             or N/m], like `12.0`, or a list with `nan` where it is not; otherwise a
-            known weight tells it.
+            known load determines it.
         damping: Derivative gain of the servos if it is known, for a comparison with the
             estimate [N m s/rad or N s/m].
         feed_forward: Gain of the command's velocity if it is known; likewise.
         alike: Words in the names of joints of one kind, like `[["hip"], ["knee"]]`:
-            they are equal as far as the logs do not differ. By default joints whose
-            names differ only in a side are of one kind.
-        contacts: When something holds the robot, by the clock of the logs, like
-            `[[6.5, 64.7]]`, or by the name of the log, as in `{ sines = [[6.5, 64.7]]
-            }`; these samples do not count [s].
+            they get similar parameters unless the logs contradict. By default joints
+            whose names differ only in a side are of one kind.
+        contacts: Times in which something holds the robot, like `[[6.5, 64.7]]`, or
+            those of single logs, as in `{ sines = [[6.5, 64.7]] }`; these samples do
+            not count [s].
         samples: Number of MJCF files drawn from the distribution of the estimates.
     """
 

@@ -96,16 +96,19 @@ class LogReading:
     """Files and parts of the logs, and how they are read.
 
     Attributes:
-        forces_file: File of the forces, if they lie in another file beside the log,
-            like `"{}_torque.csv"`: "{}" stands for the log's name without its suffix.
+        forces_file: File of the forces, if they are in another file in the folder of
+            the log, like `"{}_torque.csv"`: "{}" is replaced by the log's name without
+            its suffix.
         velocities_file: File of the velocities, likewise, like `"{}_speed.csv"`.
         commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid
             rollout` needs no `forces`.
         lerobot_calibration: Calibration file of LeRobot for `angle_unit = "%"`, like
             `"my_arm.json"`: angles count from the middle of each calibrated range.
-        force_delay: Time by which forces stand later in the log than angles [s].
-        largest_gap: Longest pause that is bridged, in sample times; a tenth of the
-            period of the filter's cut-off frequency is bridged in any case.
+        force_delay: Time by which the forces in the log are late, compared with the
+            angles [s].
+        largest_gap: Longest gap that is interpolated, in sample times; gaps up to a
+            tenth of the period of the filter's cut-off frequency are always
+            interpolated.
         bad_rows: float of the rows that may be bad, and are left out.
         start: Start of the part of every log that is used [s], like `0.0`.
         stop: End of that part [s], like `10.0`.

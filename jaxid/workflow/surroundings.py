@@ -57,7 +57,7 @@ class Collision:
     Attributes:
         distance: Distance that must remain [m].
         fit: Whether to fit capsules around the geometry of the robot's links.
-        packages: Folder of what the URDF file calls `package://`, like `"."`.
+        packages: Folder to which `package://` in the URDF file refers, like `"."`.
         floor: Height of the floor [m], "base" for the plane on which the robot stands,
             or false for none.
         capsules: Capsules on bodies or on the ground, like
@@ -66,8 +66,8 @@ class Collision:
         boxes: Boxes in the world, with angles in degrees, like
             `[{ name = "table", centre = [0.8, 0, 0.2], size = [1, 1, 1], rotation = [0,
             0, 45] }]`.
-        pairs: Pairs of shapes to watch, like `[["gun", "table"]]`; by default all that
-            the joints can bring together.
+        pairs: Pairs of shapes to check, like `[["gun", "table"]]`; by default all pairs
+            that the joints can bring together.
     """
 
     distance: float = 0.03

@@ -43,6 +43,14 @@ def test_false_alarms_are_as_rare_as_promised():
     assert wrong / DRAWS / SIZE > 0.1, "the other's interval is the wrong yardstick"
 
 
+def test_a_difference_that_is_rounded_to_zero_has_no_sign():
+    difference = np.zeros(SIZE)
+    difference[:3] = -1e-6, 1e-6, 0.02
+    first, second = (fit(p, 1e-4 * np.eye(SIZE)) for p in (0 * difference, difference))
+    columns = {c.name: c.values for c in jid.compare(first, second).summary().columns}
+    assert columns["difference"][:3] == ("0.000", "0.000", "+0.020")
+
+
 def test_estimated_deviations_widen_intervals_and_joint_tests():
     """Covariances from few samples, where normal quantiles make tests err too often."""
     (a, _), roots, random = covariances(1)

@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from rich.console import Console
 
+import jaxid as jid
 from jaxid.cli.terminal import show
 from jaxid.report.identification_page import body_table
 from jaxid.result_table import (
@@ -126,6 +127,44 @@ def test_names_are_folded_and_never_cut(width):
         assert "1.50" not in code
         assert "".join(code.split()) == expressions[k].replace(" ", "")
     assert all(text in folded.text(width) for text in ("1.50", "10.5"))
+
+
+@pytest.mark.parametrize("width", [50, 60, 70, 80])
+@pytest.mark.parametrize("numbers", [1, 8])
+def test_names_are_folded_at_underscores_only(width, numbers):
+    """Blocks repeat the names, not only the numbers of the rows."""
+    names = ["shoulder_pan_joint", "left_arm_shoulder_lift_joint"]
+    columns = [Column(f"number {k}", [1.5, 10.5], "N m") for k in range(numbers)]
+    verdicts = Column("verdict", ["no change seen", "changed"])
+    rows = Column("#", [1, 2])
+    text = Table("", rows, Column("joint", names), *columns, verdicts).text(width)
+    blocks = text.split("\n\n")
+    for block in blocks:
+        words = {word for line in block.splitlines() for word in line.split()}
+        assert "shoulder_pan_joint" in words
+        parts = {"left_arm_shoulder_lift_", "joint"}
+        assert names[1] in words or parts <= words
+    assert (len(blocks) > 1) == (numbers > 1)
+    assert max(map(len, text.splitlines())) <= width
+
+
+@pytest.mark.parametrize("robot", [jid.robots.panda(), jid.robots.tx90l_on_rail()])
+def test_numbers_of_the_joints_have_a_unit_each(robot):
+    header = [column.header for column in robot.summary().columns]
+    assert len({tuple(lines) for lines in header}) == len(header)
+    is_number = [column.kind == "number" for column in robot.summary().columns]
+    units = [lines[-1].strip("[]") for lines in np.array(header, object)[is_number]]
+    if robot.revolute[0]:
+        assert units == ["rad", "rad", "rad/s", "rad/s²", "N m"]
+    else:
+        assert units == ["unit", "unit", "unit/s", "unit/s²", "force unit"]
+        assert ["unit"] in header
+        assert ["force unit"] in header
+
+
+def test_numbers_that_are_rounded_to_zero_have_no_sign():
+    assert with_deviation(-0.0004, 0.12) == ("0.00", "0.12")
+    assert with_deviation(-0.006, 0.12) == ("-0.01", "0.12")
 
 
 def test_the_terminal_shows_the_same_letters_in_colour():

@@ -32,8 +32,8 @@ class BodyBounds(eqx.Module):
 
     Attributes:
         mass_max: Largest mass of each body [kg], like `50.0`.
-        radius: Radius of the sphere about the origin of each body's frame that holds it
-            [m], like `0.6`.
+        radius: Radius of the sphere about the origin of each body's frame that contains
+            the body [m], like `0.6`.
         mass_min: Smallest mass of each body [kg], like `0.5`.
         centre_min: Lower corners of boxes for the centres of mass [m], like `[-0.2,
             -0.2, 0.0]`; -inf for none.

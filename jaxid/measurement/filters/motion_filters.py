@@ -49,11 +49,11 @@ class ZeroPhaseButterworth(AbstractFilter):
     differentiated twice. With an infinite `cutoff` nothing is filtered.
 
     Attributes:
-        cutoff: Cut-off of angles and velocities, of one direction as in scipy [Hz],
-            like `10.0`.
-        order: Order of one direction.
+        cutoff: Cut-off of angles and velocities for one of the two passes, as in scipy
+            [Hz], like `10.0`.
+        order: Order of one pass.
         force_cutoff: Cut-off of forces and columns [Hz], like `20.0`; `cutoff` if None;
-            infinite if decimation alone shall limit their band.
+            infinite if decimation alone should limit their band.
         margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter
             has settled if None.
     """

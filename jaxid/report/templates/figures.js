@@ -319,7 +319,7 @@
     code.textContent = await unpack(document.getElementById("library").textContent);
     document.head.append(code);
   } catch (error) {
-    charts.forEach((chart) => { chart.title = "To zoom into this figure takes a browser of 2023 or later."; });
+    charts.forEach((chart) => { chart.title = "To zoom into this figure, use a browser of 2023 or later."; });
     throw error;
   }
   const near = new IntersectionObserver((seen) => seen.forEach((entry) => entry.isIntersecting && draw(entry.target)), { rootMargin: "600px" });
