@@ -30,8 +30,6 @@ PADDING = 2
 """Blanks between two columns."""
 MIN_TEXT_WIDTH = 12
 """Characters of a line to which a column of texts may be folded."""
-MAX_NAME_WIDTH = 24
-"""Characters of a line from which on names are folded, at their underscores."""
 UNSEEN_CHARACTERS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
 )
@@ -223,12 +221,11 @@ class Column:
 
     @property
     def min_width(self) -> int:
-        """Characters of a line that the column needs; only texts can be folded."""
+        """Characters of a line that the column needs; texts fold between words only."""
         if self.kind == "number":
             return self.width
-        parts = fold_names(" ".join((*self.header, *self.texts))).split()
-        longest_part = max(map(len, parts), default=0)
-        return max(longest_part, min(self.width, MIN_TEXT_WIDTH))
+        words = " ".join((*self.header, *self.texts)).split()
+        return max(min(self.width, MIN_TEXT_WIDTH), *map(len, words))
 
     @property
     def width(self) -> int:
@@ -251,21 +248,6 @@ class Column:
             text + " " * (width - length)
             for text, length in zip(texts, lengths, strict=True)
         ]
-
-
-def fold_names(text: str) -> str:
-    """Return a text with line breaks behind underscores of long names."""
-    return re.sub(
-        rf"(?=\S{{{MAX_NAME_WIDTH + 1}}})(\S{{1,{MAX_NAME_WIDTH - 1}}}_)", r"\1\n", text
-    )
-
-
-def unit_columns(name: str, units: Iterable[str]) -> tuple[str, list[Column]]:
-    """Return the unit of all rows; if they differ, `name` and a column of that name."""
-    column = Column(name, tuple(units))
-    if len(set(column.values)) == 1:
-        return column.values[0], []
-    return name, [column]
 
 
 def estimate_columns(
@@ -388,8 +370,9 @@ class Table:
             facts = [(Text(word, "dim"), text) for word, text in self.facts]
             parts.append(_two_columns(facts))
         if self.columns:
-            blocks = self._blocks(options.max_width)
-            parts += [self._grid(columns, options.max_width) for columns in blocks]
+            max_width = options.max_width - (1 + PADDING) * bool(self.status)
+            blocks = self._blocks(max_width)
+            parts += [self._grid(columns, max_width) for columns in blocks]
         if self.remarks:
             remarks = [(_mark(remark.status), remark.line) for remark in self.remarks]
             parts.append(_two_columns(remarks))
@@ -403,32 +386,15 @@ class Table:
 
     def _blocks(self, max_width: int) -> list[list[Column]]:
         """Return columns in groups that fit a width; each begins with the names."""
-        # Numbers of rows are not names: the names after them are repeated, too.
-        kinds = [column.kind == "number" for column in self.columns[:2]]
-        keys = self.columns[: 2 if kinds == [True, False] else 1]
-        blocks = [list(keys)]
-        for column in self.columns[len(keys) :]:
+        names, *columns = self.columns
+        blocks = [[names]]
+        for column in columns:
             block = [*blocks[-1], column]
-            width = self._mark_width + sum(x.min_width + PADDING for x in block)
-            if width - PADDING > max_width and len(block) > len(keys) + 1:
-                blocks.append([*keys, column])
+            if _space(block, max_width) < 0 and len(block) > 2:
+                blocks.append([names, column])
             else:
                 blocks[-1] = block
         return blocks
-
-    @property
-    def _mark_width(self) -> int:
-        """Characters of a line that the marks take."""
-        return 1 + PADDING if self.status else 0
-
-    def _widths(self, columns: Sequence[Column], max_width: int) -> list[int]:
-        """Return the widths of columns; those of texts share the space that is left."""
-        min_widths = [column.min_width for column in columns]
-        space = max_width - self._mark_width - sum(min_widths)
-        space -= PADDING * (len(columns) - 1)
-        texts = [column for column in columns if column.width > column.min_width]
-        share = max(space, 0) // max(len(texts), 1)
-        return [min(column.width, column.min_width + share) for column in columns]
 
     def _grid(self, columns: Sequence[Column], max_width: int) -> Any:
         """Return marks and columns as a table of `rich`, which folds texts to fit."""
@@ -437,31 +403,36 @@ class Table:
         from rich.text import Text
 
         grid = Grid(box=None, padding=(0, PADDING, 0, 0), pad_edge=False)
+        cells: list[Any] = []
         if self.status:
             grid.add_column(width=1)
-        cells = []
-        widths = self._widths(columns, max_width)
-        for column, width in zip(columns, widths, strict=True):
+            cells.append(map(_mark, self.status))
+        folded_columns = [x for x in columns if x.width > x.min_width]
+        share = max(_space(columns, max_width), 0) // (len(folded_columns) or 1)
+        for column in columns:
             texts = column.texts
             header = Text("\n".join(column.header), "bold")
+            width = min(column.width, column.min_width + share)
             if column.kind == "number":
                 header.justify = "right"
                 # Blanks before a number, not its justification, which would take
                 # those behind it away.
                 texts = [text.rjust(width) for text in texts]
-            elif width < column.width:
-                texts = [fold_names(text) for text in texts]
             grid.add_column(header, width=width, overflow="fold")
             cells.append(map(Text, texts))
 
         # Even these few columns may be wider than the terminal: nothing is cut then.
-        grid.width = self._mark_width + sum(widths) + PADDING * (len(widths) - 1)
+        grid.width = sum(column.width + PADDING for column in grid.columns) - PADDING
         for k, row in enumerate(zip(*cells, strict=True)):
             if k in self.rules:
                 grid.add_row(*[Rule(style="dim")] * len(grid.columns))
-            mark = [_mark(self.status[k])] if self.status else []
-            grid.add_row(*mark, *row)
+            grid.add_row(*row)
         return grid
+
+
+def _space(columns: Sequence[Column], max_width: int) -> int:
+    """Return the characters of a line that columns leave if texts are folded."""
+    return max_width + PADDING - sum(x.min_width + PADDING for x in columns)
 
 
 def _two_columns(rows: Iterable[tuple[Any, str]]) -> Any:

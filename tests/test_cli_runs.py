@@ -247,7 +247,7 @@ def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
     assert added["fit"]["rows"] == together["fit"]["rows"]
     assert added["settings"]["identification"] == ["given", "b.csv"]
     assert [e["recording"] for e in added["errors"]["identification"]] == ["b"]
-    said = "have seen the same data"
+    said = "contain the same data"
     assert refused(
         run("identify", "experiment.toml", "first", "a.csv", "-o", "twice"), said
     )

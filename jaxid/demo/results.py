@@ -14,7 +14,6 @@ from jaxid.report.page import Section, folded, picture, render_page
 from jaxid.report.result_files import write_json
 from jaxid.report.result_records import header
 from jaxid.result_table import (
-    MISSING,
     Column,
     Remark,
     Status,
@@ -141,11 +140,6 @@ def paper_table(study: Study) -> Table:
             "mean error, worst axis, verification [%]",
             "below 1",
             max_error_text(study.weighted_model.mean_errors(1)),
-        ),
-        (
-            "verification, by the true parameters [%]",
-            MISSING,
-            max_error_text(study.true_model.mean_errors(1)),
         ),
         ("mass matrix without weights", "not positive definite", definiteness_texts[0]),
         ("mass matrix with weights", "positive definite", definiteness_texts[1]),

@@ -261,7 +261,6 @@ class BaseParameters(Summarised, Hashable):
         count = f"{self.size} base parameters of {self.model.size} standard parameters"
         return Table(
             f"{self.model.robot.name}: {count}",
-            Column("no.", list(range(1, self.size + 1))),
             Column("parameter", self.names),
             Column("combination", self.expressions, kind="code"),
             Column("unit", self.units),

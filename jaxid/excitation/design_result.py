@@ -176,7 +176,6 @@ class ExcitationPlan(Summarised, eqx.Module):
         base = self.base
         return Table(
             "expected standard deviations",
-            Column("#", list(range(1, base.size + 1))),
             Column("parameter", base.names),
             Column("±", self.standard_deviations),
             Column("unit", base.units),

@@ -163,7 +163,6 @@ class Comparison(Summarised, eqx.Module):
         percent = f"{100 * LEVEL:g} %"
         return Table(
             f"{self.first.name} and {self.second.name}: {len(kinds)} base parameters",
-            Column("#", list(range(1, len(kinds) + 1))),
             Column("parameter", self.names),
             Column("unit", self.units),
             Column(self.first.name, estimates[0], kind="number"),

@@ -64,11 +64,6 @@ class RunsReport(Summarised):
             return Remark(text, Status.DOUBTFUL)
         return Remark(self.answer.sentence, Status.GOOD)
 
-    @property
-    def status(self) -> Status:
-        """Judgement of the result: that of the verdict."""
-        return self.verdict.status
-
     def tables(self) -> list[Table]:
         """Return all tables of the result, then the findings and the verdict."""
         findings = Table("", remarks=dict.fromkeys([*self.findings, self.verdict]))
@@ -108,7 +103,7 @@ class RunsReport(Summarised):
             ("Estimates", [*self.details, estimates, self.answer.words]),
             provenance(self.settings),
         ]
-        if self.answer.experiment_lines and self.status is not Status.BAD:
+        if self.answer.experiment_lines and self.verdict.status is not Status.BAD:
             text = code("\n".join(self.answer.experiment_lines))
             sections.insert(1, ("For the experiment file", [text]))
         page = render_page(self.answer.title, sections)

@@ -19,7 +19,7 @@ from jaxid.arrays import (
     namespace,
 )
 from jaxid.errors import InputError
-from jaxid.result_table import Column, Remark, Status, Summarised, Table, unit_columns
+from jaxid.result_table import Column, Remark, Status, Summarised, Table
 
 from .follower_joints import Followers, order_from_ground
 from .inertia import IMPOSSIBLE, Inertia
@@ -382,10 +382,7 @@ class Robot(Summarised, eqx.Module):
             InputError: If the mass is not positive, or no body has such an inertia.
         """
         placed_tool = Tool(
-            self.tip_body,
-            mass=mass,
-            centre_of_mass=centre_of_mass,
-            inertia=inertia,
+            self.tip_body, mass=mass, centre_of_mass=centre_of_mass, inertia=inertia
         )
         load = placed_tool.body_inertia.moved(self.tip_rotation, self.tip_offset)
         tool = dataclasses.replace(
@@ -401,6 +398,15 @@ class Robot(Summarised, eqx.Module):
         """Return the unit of a joint's generalised force: N m or N."""
         return "N m" if self.revolute[joint] else "N"
 
+    def unit_columns(self) -> tuple[str, str, list[Column]]:
+        """Return the units of coordinates and forces; if they differ, as columns."""
+        units = [self.joint_unit(j) for j in range(self.joints)]
+        if len(set(units)) == 1:
+            return units[0], self.force_unit(0), []
+        force_units = [self.force_unit(j) for j in range(self.joints)]
+        columns = [Column("unit", units), Column("force unit", force_units)]
+        return "unit", "force unit", columns
+
     @property
     def remarks(self) -> list[Remark]:
         """Notes, of which those on bodies that nobody can have built are doubts."""
@@ -413,11 +419,7 @@ class Robot(Summarised, eqx.Module):
     def summary(self) -> Table:
         """Return a table of the joints: parents, ranges, speeds and largest forces."""
         names = ("ground", *self.body_names)
-        joints = range(self.joints)
-        unit, units = unit_columns("unit", map(self.joint_unit, joints))
-        force_unit, force_units = unit_columns(
-            "force unit", map(self.force_unit, joints)
-        )
+        unit, force_unit, units = self.unit_columns()
         limits = self.limits
         tip_carrier = self.body_names[self.tip_body]
         facts = [("end-effector", f"on the body of `{tip_carrier}`")]
@@ -436,7 +438,6 @@ class Robot(Summarised, eqx.Module):
             Column("to", np.asarray(limits.position_max), unit),
             Column("speed", np.asarray(limits.velocity), f"{unit}/s"),
             Column("acceleration", np.asarray(limits.acceleration), f"{unit}/s²"),
-            *force_units,
             Column("force", self.known_max_forces, force_unit),
             facts=facts,
             remarks=self.remarks,

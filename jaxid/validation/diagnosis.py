@@ -15,14 +15,12 @@ from jaxid.measurement.observations import Observations, Progress, observe
 from jaxid.measurement.reading import PART_SIZE, SamplesOnDisk, read_excerpt
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import (
-    MISSING,
     Column,
     Remark,
     Status,
     Summarised,
     Table,
     significant,
-    unit_columns,
 )
 from jaxid.robot.robot import Robot
 
@@ -86,11 +84,7 @@ class Diagnosis(Summarised):
         statistics = self.statistics
         limits = robot.limits
         gaps = len(log.segments) - 1
-        joints = range(robot.joints)
-        unit, units = unit_columns("unit", map(robot.joint_unit, joints))
-        force_unit, force_units = unit_columns(
-            "force unit", map(robot.force_unit, joints)
-        )
+        unit, force_unit, units = robot.unit_columns()
         return Table(
             f"log {log.name} (limits of the robot in brackets)",
             Column("joint", robot.joint_names),
@@ -100,7 +94,6 @@ class Diagnosis(Summarised):
             _column_with_limits(
                 "speed", statistics.speed, limits.velocity, f"{unit}/s"
             ),
-            *force_units,
             _column_with_limits(
                 "force", statistics.force, robot.known_max_forces, force_unit
             ),
@@ -137,11 +130,8 @@ def _column_with_limits(
     name: str, values: np.ndarray, limits: AnyArray, unit: str
 ) -> Column:
     """Return a column of values with limits in brackets."""
-    pairs = zip(values.tolist(), np.asarray(limits).tolist(), strict=True)
-    texts = [
-        f"{significant(x)} ({MISSING if np.isinf(y) else significant(y)})"
-        for x, y in pairs
-    ]
+    pairs = zip(values, np.asarray(limits), strict=True)
+    texts = [f"{significant(x)} ({significant(limit)})" for x, limit in pairs]
     return Column(name, texts, unit, kind="number")
 
 

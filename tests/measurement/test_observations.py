@@ -152,7 +152,7 @@ def test_motor_side_goes_through_the_drives(angles, forces):
             2,
             DT,
             [ZeroPhaseButterworth(20.0), Subsample(26)],
-            "one of 25 samples at most",
+            "step of at most 25 samples",
         ),
         (
             2,

@@ -100,7 +100,7 @@ X = np.zeros((20, 2))
         ({"sample_time": None}, "either `time` or `sample_time`"),
         ({"sample_time": 0.0}, "`sample_time` must be positive"),
         ({"sample_time": None, "time": np.arange(19.0)}, r"`time` .* shape \(19,\)"),
-        ({"sample_time": None, "time": np.zeros(20)}, "stands still"),
+        ({"sample_time": None, "time": np.zeros(20)}, "does not advance"),
         (
             {"velocities": np.where(np.arange(20) == 3, np.inf, X.T).T},
             "`velocities` .* row 4",

@@ -129,21 +129,17 @@ def test_names_are_folded_and_never_cut(width):
     assert all(text in folded.text(width) for text in ("1.50", "10.5"))
 
 
-@pytest.mark.parametrize("width", [50, 60, 70, 80])
+@pytest.mark.parametrize("width", [60, 70, 80])
 @pytest.mark.parametrize("numbers", [1, 8])
-def test_names_are_folded_at_underscores_only(width, numbers):
-    """Blocks repeat the names, not only the numbers of the rows."""
+def test_names_are_never_folded_inside(width, numbers):
+    """Tables go on below instead, with the names in each block."""
     names = ["shoulder_pan_joint", "left_arm_shoulder_lift_joint"]
     columns = [Column(f"number {k}", [1.5, 10.5], "N m") for k in range(numbers)]
     verdicts = Column("verdict", ["no change seen", "changed"])
-    rows = Column("#", [1, 2])
-    text = Table("", rows, Column("joint", names), *columns, verdicts).text(width)
+    text = Table("", Column("joint", names), *columns, verdicts).text(width)
     blocks = text.split("\n\n")
     for block in blocks:
-        words = {word for line in block.splitlines() for word in line.split()}
-        assert "shoulder_pan_joint" in words
-        parts = {"left_arm_shoulder_lift_", "joint"}
-        assert names[1] in words or parts <= words
+        assert set(names) <= set(block.split())
     assert (len(blocks) > 1) == (numbers > 1)
     assert max(map(len, text.splitlines())) <= width
 
