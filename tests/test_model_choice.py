@@ -123,4 +123,4 @@ def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys)
             now[0] += 4.0
     lines = capsys.readouterr().err.splitlines()
     # Other stages follow: this one is four fifths of the whole.
-    assert lines == ["measuring errors: 24 %, about 38 s left"]
+    assert lines == ["measuring errors: 27 %, about 32 s left"]

@@ -109,9 +109,6 @@ def paper_table(study: Study) -> Table:
     speed, acceleration = study.tip_maxima
     definiteness_texts = [str(model.validation.definiteness) for model in study.models]
 
-    def max_error_text(errors: list[float]) -> str:
-        return significant(max(errors), 2)
-
     rows = [
         ("parameters, all of them", "70", str(base.model.size)),
         ("base parameters", "44", str(base.size)),
@@ -134,12 +131,12 @@ def paper_table(study: Study) -> Table:
         (
             "mean error, worst axis, identification [%]",
             "below 1",
-            max_error_text(study.weighted_model.mean_errors(0)),
+            significant(max(study.weighted_model.mean_errors(0)), 2),
         ),
         (
             "mean error, worst axis, verification [%]",
             "below 1",
-            max_error_text(study.weighted_model.mean_errors(1)),
+            significant(max(study.weighted_model.mean_errors(1)), 2),
         ),
         ("mass matrix without weights", "not positive definite", definiteness_texts[0]),
         ("mass matrix with weights", "positive definite", definiteness_texts[1]),
