@@ -123,8 +123,7 @@ def progress_bar() -> Iterator[Progress]:
     console = open_console(stderr=True)
     columns = Bar.get_default_columns()
     bar = Bar(SpinnerColumn(), *columns, console=console, transient=True)
-    bar.add_task("starting", total=1.0)
-    (task,) = bar.tasks
+    task = bar.tasks[bar.add_task("starting", total=1.0)]
     is_silent = not console.is_terminal
     with contextlib.nullcontext() if is_silent else bar:
         stage_start = stage_fraction = 0.0

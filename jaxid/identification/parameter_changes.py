@@ -203,7 +203,6 @@ class Comparison(Summarised, eqx.Module):
             "all parameters of a kind at once",
             Column("kind", [group["name"] for group in groups]),
             Column("parameters", [group["parameters"] for group in groups]),
-            Column("statistic", [group["statistic"] for group in groups]),
             Column("probability\nby chance", chances, kind="number"),
             Column("verdict", verdicts),
             status=[_status(group["changed"]) for group in groups],

@@ -404,8 +404,8 @@ class Robot(Summarised, eqx.Module):
         if len(set(units)) == 1:
             return units[0], self.force_unit(0), []
         force_units = [self.force_unit(j) for j in range(self.joints)]
-        unit_column = Column("force unit", force_units)
-        return "unit", "force unit", [Column("unit", units), unit_column]
+        columns = [Column("unit", units), Column("force unit", force_units)]
+        return "unit", "force unit", columns
 
     @property
     def remarks(self) -> list[Remark]:
