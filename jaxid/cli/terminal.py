@@ -24,8 +24,9 @@ LONG_STAGES = re.compile("best so far|round|effects|mistakes|measuring|writing")
 LONG_PART = 0.9
 """Part of the time left that such a stage takes.
 
-Measured (CPU time) on the example, the UR10 and the KR300: the search for mistakes takes
-83 to 97 % of the time left, the rounds of `choose` 89 %, other stages mostly 1 to 12 %.
+Measured (CPU time) on the example, the UR10 and the KR300: the search for mistakes
+takes 83 to 97 % of the time left, the rounds of `choose` 89 %, other stages mostly 1 to
+12 %.
 """
 SHORT_PART = 0.07
 """Part of the time left that another stage takes."""
@@ -123,7 +124,8 @@ def progress_bar() -> Iterator[Progress]:
     console = open_console(stderr=True)
     columns = Bar.get_default_columns()
     bar = Bar(SpinnerColumn(), *columns, console=console, transient=True)
-    task = bar.tasks[bar.add_task("starting", total=1.0)]
+    bar.add_task("starting", total=1.0)
+    (task,) = bar.tasks
     is_silent = not console.is_terminal
     with contextlib.nullcontext() if is_silent else bar:
         stage_start = stage_fraction = 0.0

@@ -255,7 +255,7 @@ def test_forces_far_below_those_of_the_files_bodies_are_doubted(
         )
         errors = (first,), (second,), validation.definiteness
         remarks = judge(Report(fit, *errors, claimed=(claims,))).findings
-        doubts = [x for x in remarks if "bodies of the robot's file" in x.text]
+        doubts = [x for x in remarks if "bodies in the robot's file" in x.text]
         assert bool(doubts) == (is_doubted and bool(np.any(forces)))
         assert all("need 11 times" in doubt.text for doubt in doubts)
 

@@ -324,7 +324,7 @@ def test_moments_that_rounding_makes_impossible_are_noted(tmp_path, moments, is_
     path = tmp_path / "arm.urdf"
     body = inertial(1.0, (0, 0, 0), (0, 0, 0), moments)
     path.write_text(robot(link("base"), link("a", body), joint("j1", "base", "a")))
-    notes = [note for note in load_urdf(path).notes if "by rounding" in note]
+    notes = [note for note in load_urdf(path).notes if "because of rounding" in note]
     assert len(notes) == is_noted
     assert all("link `a`" in note for note in notes)
     file = RobotFile(str(path))
