@@ -227,12 +227,12 @@ with tempfile.TemporaryDirectory() as folder:
 #
 # ## Exercise
 #
-# The file of the robot claims a link 30 % too heavy. Which of these change: the base parameters' expressions, the estimates by `jid.identify` without a prior, the
+# In the file of the robot, the mass of one link is 30 % too large. Which of these change: the base parameters' expressions, the estimates by `jid.identify` without a prior, the
 # estimates by `jaxid identify`?
 #
 # <details markdown="1"><summary>Answer</summary>
 #
-# Expressions depend on the geometry alone: no change. `jid.identify` without a prior never sees the claimed masses, since a `Robot` holds none: no change.
+# Expressions depend on the geometry alone: no change. `jid.identify` without a prior does not use the masses of the file, since a `Robot` holds none: no change.
 # `jaxid identify` takes them as a prior where the log is silent: masses that forces cannot separate move, the forces hardly do.
 #
 # </details>

@@ -1,7 +1,7 @@
 # %% [markdown]
 # # 10 · No torque in the log
 #
-# Many robots log what they were told and where they went, and no torque. Such logs still suffice for a simulation that moves like the robot: the parameters for which the
+# Many robots log their commands and their positions, but no torque. Such logs still suffice for a simulation that moves like the robot: the parameters for which the
 # simulated joint, given the recorded commands, stays on the recorded positions. Here a joint with a position servo is simulated on MuJoCo, which shares no code with
 # `jaxid`, with dry friction, delay and a 12-bit encoder.
 

@@ -95,8 +95,8 @@ def remarks(study: Study) -> list[Remark]:
             f"{true_verification:.2g} %.",
         ),
         Remark(
-            f"Without weights the error of the last axis is {error:.2g} %, with "
-            f"weights {weighted_error:.2g} % of its largest torque.",
+            f"The error of the last axis is {error:.2g} % of its largest torque "
+            f"without weights, and {weighted_error:.2g} % with weights.",
             Status.GOOD if weighted_error < error else Status.BAD,
         ),
     ]
@@ -260,9 +260,10 @@ def _identification(study: Study) -> Section:
     unweighted_errors = study.unweighted_model.validation.errors[0]
     weighted_errors = study.weighted_model.validation.errors[0]
     return "Identification with and without weights", [
-        "Cold and warm, the servo follows the motion at 1000 Hz. Logs hold angles of "
-        "17-bit encoders and torques with 1 % of noise, ripple, stiction and Stribeck "
-        f"friction. Filter (Eq. 25): {log.filter}; {log.rows} rows of each joint.",
+        "The servo follows the motion at 1000 Hz, once cold and once warm. Logs "
+        "contain angles from 17-bit encoders and torques with 1 % of noise, ripple, "
+        f"stiction and Stribeck friction. Filter (Eq. 25): {log.filter}; {log.rows} "
+        "rows of each joint.",
         picture(
             jid.plot.torques(
                 unweighted_errors, robot, "identified without weights", FIGURE_AXES

@@ -308,7 +308,7 @@ class Fit(Summarised, eqx.Module):
             return [Remark(text, Status.GOOD)]
         combinations = "1 combination" if count == 1 else f"{count} combinations"
         worst_share = max(direction.uncertainty for direction in self.undetermined)
-        consequence = "some of which these logs do not excite at all"
+        consequence = "some of which the motion does not excite at all"
         if np.isfinite(worst_share):
             share = percent(worst_share)
             consequence = (

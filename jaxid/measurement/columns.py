@@ -275,8 +275,8 @@ def _as_unit(name: str, unit: Unit | float, quantity: Quantity) -> Unit:
         return unit
     if not np.isfinite(unit) or unit == 0:
         raise InputError(
-            f"`{name}` must be a unit, or the value of 1 in the log, a finite number "
-            f"other than zero, but is {unit}."
+            f"`{name}` must be a unit or a finite number other than zero (the value of "
+            f"1 in the log), but is {unit}."
         )
     return Unit(f"{unit:g}", float(unit), quantity)
 

@@ -124,8 +124,8 @@ class Excitation:
         if self.spline is not None:
             if self.rest:
                 raise InputError(
-                    "`rest` is for Fourier series, "
-                    "and a `spline` rests at its ends: leave one out."
+                    "`rest` belongs to Fourier series, and a `spline` starts and ends "
+                    "at rest anyway: leave one of them out."
                 )
             return self.spline
         series = (self.harmonics, self.omega)
