@@ -238,7 +238,8 @@ def planar_arm(joints: int = 2, length: Numbers = 1.0) -> Robot:
     """
     if joints < 1 or np.shape(length) not in ((), (joints,)):
         raise InputError(
-            "`joints` must be at least 1, and `length` one number or one for each."
+            "`joints` must be at least 1, and `length` one number, or one for each "
+            "joint."
         )
     lengths = np.broadcast_to(np.array(length, dtype=np.float64), (joints,))
     ends = np.outer(lengths, X)

@@ -193,7 +193,7 @@ class Robot(Summarised, eqx.Module):
         for name in (self.name, *self.body_names):
             if not name.isprintable():
                 raise InputError(
-                    f"the name {name!r} must be printable: remove the characters."
+                    f"the name {name!r} must be printable: remove all other characters."
                 )
         for follower in self.followers:
             if not 0 <= follower.leader < n:

@@ -40,9 +40,9 @@ def expand_xacro(path: Path, arguments: Mapping[str, str]) -> bytes:
         message = process.stderr.decode(errors="replace").strip()
         reason, *_ = message.splitlines() or ["no reason given"]
         raise InputError(
-            f"`{path}`: {command} fails: {reason}: give a file that it has expanded, "
-            "or the arguments that it needs (`xacro_arguments` in `[robot]`, "
-            "`jaxid init --xacro NAME:=VALUE`)."
+            f"`{path}`: {command} fails: {reason}: give the expanded file, or the "
+            "arguments that it needs (`xacro_arguments` in `[robot]`, `jaxid init "
+            "--xacro NAME:=VALUE`)."
         )
     if arguments:
         listing = _run([program, *words, "--deps"], path, command).stdout
@@ -58,8 +58,8 @@ def _run(words: list[str], path: Path, command: str):
         )
     except subprocess.TimeoutExpired as error:
         raise InputError(
-            f"`{path}`: {command} has not ended after {MAX_SECONDS:g} s: "
-            "give a file that it has expanded."
+            f"`{path}`: {command} has not ended after {MAX_SECONDS:g} s: give the "
+            "expanded file."
         ) from error
 
 

@@ -333,8 +333,9 @@ def _mistakes(
         name = f"{log_name}: " if len(diagnoses) > 1 else ""
         limits = list(limited_forces(recording))
         doubts += [
-            f"{name}{force.sentence(model.robot)}, and the model needs more: the "
-            "sensor or the log cuts off; leave that part out (`recording.stop`)."
+            f"{name}{force.sentence(model.robot)}, and the model needs larger ones: "
+            "the sensor or the log clips them; leave that part out "
+            "(`recording.stop`)."
             for force in clipped_forces(model, recording, limits)
         ]
     if not recordings:

@@ -176,7 +176,8 @@ def _of_each_body(name: str, value: Numbers, bodies: int, *shape: int) -> np.nda
     array = np.array(value, np.float64)
     if np.isnan(array).any() or array.shape not in ((), shape, (bodies, *shape)):
         raise InputError(
-            f"`{name}` must be for all or each of {bodies} bodies: {value}."
+            f"`{name}` must be one for all bodies, or one for each of {bodies}, but is "
+            f"{value}."
         )
     return np.broadcast_to(array, (bodies, *shape)).copy()
 

@@ -232,7 +232,7 @@ def _require_count(bodies: AnyArray, feasible: FeasibleSet) -> None:
     """Check that a prior has as many bodies as the model."""
     count = len(feasible.bodies)
     if len(bodies) != count:
-        raise InputError(f"`bodies` of a prior must be those of {count} bodies.")
+        raise InputError(f"`bodies` of a prior must describe {count} bodies.")
 
 
 def _solve(program: ConeProgram) -> solver.Optimum:
