@@ -94,7 +94,10 @@ class RunsReport(Summarised):
             Table("", facts=facts),
             [remark for remark in remarks if remark != self.verdict],
         ]
-        estimates: Any = Table("", *self.result.summary().columns)
+        estimates: Any = self.result.summary()
+        estimates.title = ""
+        # They are findings, at a glance.
+        estimates.remarks = ()
         if self.details:
             estimates = folded("All estimates", estimates)
         sections: list[Section] = [

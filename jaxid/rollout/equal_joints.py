@@ -42,7 +42,9 @@ def joint_groups(
     if alike is not None:
         kinds = list(names)
         for words in alike:
-            members = [k for k, name in enumerate(names) if _has_word(name, words)]
+            members = [
+                k for k, name in enumerate(names) if any(word in name for word in words)
+            ]
             if not members:
                 raise InputError(
                     f"`alike`: no joint has {' or '.join(words)} in its name; the "
@@ -59,10 +61,6 @@ def joint_groups(
         tuple(k for k, x in enumerate(kinds) if x == kind)
         for kind in dict.fromkeys(kinds)
     )
-
-
-def _has_word(name: str, words: Sequence[str]) -> bool:
-    return any(word in name for word in words)
 
 
 def _kind_of(name: str) -> str:

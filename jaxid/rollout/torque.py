@@ -328,7 +328,7 @@ def identify_torque_rollout(
     start = np.append(torque_fit, 0.0)
     # Large robots are simulated in fewer windows.
     stride = math.ceil(windows.measured.size * len(start) / MAX_DERIVATIVES)
-    windows = Windows(*(np.asarray(x)[..., ::stride] for x in windows))
+    windows = Windows.of(logs, horizon, 0.2 * horizon * stride)
     _require_stable_simulation(rollout, start, windows, horizon)
     limits = np.full(len(start), np.inf)
     limits[-1] = MAX_DELAY
@@ -411,7 +411,5 @@ def _uncertainty(minimum: Minimum, block_numbers: np.ndarray) -> Uncertainty:
     information = jacobian.T @ jacobian
     inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
     covariance, degrees_of_freedom = block_covariance(blocks, inverse)
-    naive_covariance = inverse * float(np.mean(residuals**2))
-    return Uncertainty(
-        covariance, np.full(len(inverse), degrees_of_freedom), naive_covariance
-    )
+    dof = np.full(len(inverse), degrees_of_freedom)
+    return Uncertainty(covariance, dof, covariance)
