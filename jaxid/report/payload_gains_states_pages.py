@@ -67,9 +67,9 @@ def payload_answer(
             (f"{mass} ± {half_width} kg", "mass, with its 95 % interval"),
             (
                 f"{loaded_residual} %",
-                ("torque error (RMS over RMS) of the model with the payload"),
+                "torque error (RMS over RMS) on the logs with the payload",
             ),
-            (f"{residual} %", "torque error of the model without the payload"),
+            (f"{residual} %", "torque error on the logs without the payload"),
         ],
         figures,
         f"All values are in the frame of the body that {joint} moves. A_c to F_c are "

@@ -191,7 +191,10 @@ def _common_force_findings(robot: Robot, statistics: LogStatistics) -> list[str]
     """Report forces that are all too large or too small: one unit or side is wrong."""
     ratios = statistics.force / robot.known_max_forces
     ratios = ratios[np.isfinite(robot.known_max_forces)]
-    cure = "check `recording.force_unit`, `forces_side` and `torque_constants`."
+    cure = (
+        "check `recording.force_unit`, `torque_constants`, and `forces_side` with "
+        "`drives.gear_ratios`."
+    )
     if ratios.size < 2:
         return []
     minimum = ratios.min()
