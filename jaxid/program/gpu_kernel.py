@@ -94,6 +94,7 @@ def _call_kernel(program: Program, inputs: list[Array], interpret: bool):
     samples = inputs[-1]
     count = len(samples)
     dtype = samples.dtype
+    positions_by_use = _positions_by_use(program)
 
     def kernel(*references):
         *columns, results = references
@@ -101,8 +102,9 @@ def _call_kernel(program: Program, inputs: list[Array], interpret: bool):
         positions = start + jnp.arange(BLOCK)
         # Threads beyond the last sample compute it again.
         rows = jnp.minimum(positions, count - 1)
-        values: list[Array] = []
-        for node in program.nodes:
+        values: dict[int, Array] = {}
+        for position in positions_by_use:
+            node = program.nodes[position]
             if node.operation is Operation.INPUT:
                 number, entry = node.place
                 column = columns[number]
@@ -110,7 +112,7 @@ def _call_kernel(program: Program, inputs: list[Array], interpret: bool):
                 value = column[entry] if is_common else column[rows, entry]
             else:
                 value = apply_node(node, values, dtype)
-            values.append(value)
+            values[position] = value
         for k, x in enumerate(program.outputs):
             value = jnp.asarray(values[x] if isinstance(x, int) else x, dtype)
             results[rows, k] = jnp.broadcast_to(value, BLOCK)
@@ -127,3 +129,17 @@ def _call_kernel(program: Program, inputs: list[Array], interpret: bool):
         interpret=interpret,
     )
     return call(*inputs)
+
+
+def _positions_by_use(program: Program):
+    """Return positions of all nodes, those of inputs where they are first read.
+
+    If all inputs were loaded at the start, a thread's registers would not hold them.
+    """
+    positions: dict[int, None] = {}
+    for position, node in enumerate(program.nodes):
+        if node.operation is not Operation.INPUT:
+            positions.update(dict.fromkeys((*node.uses, position)))
+    # Inputs that no node reads are results.
+    positions.update(dict.fromkeys(range(len(program.nodes))))
+    return tuple(positions)

@@ -7,7 +7,7 @@ that.
 """
 
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import equinox as eqx
@@ -30,6 +30,8 @@ FUNCTION_COST = 20
 CIRCULAR_FUNCTIONS = (Operation.SINE, Operation.COSINE)
 Entries = Sequence[Sequence[Array] | Array]
 """Entries of each input, in order: arrays of the batch's shape."""
+Values = Sequence[Array] | Mapping[int, Array]
+"""Values of nodes by position."""
 Results = tuple[Array, ...]
 """Distinct results that vary, in order: arrays of the batch's shape."""
 
@@ -174,7 +176,7 @@ def _reference(entries: Entries):
     return jnp.zeros((), rows[0].dtype if rows else float)
 
 
-def apply_node(node: Node, values: list[Array], dtype: Any):
+def apply_node(node: Node, values: Values, dtype: Any) -> Array:
     """Compute a node from the values of those before it."""
     operands = [values[x] if isinstance(x, int) else x for x in node.operands]
     if node.operation is Operation.SELECT:

@@ -99,6 +99,15 @@ def test_every_operation():
     np.testing.assert_allclose(jax.jit(kernel)(x.T), expected, rtol=3e-15)
 
 
+def test_results_that_are_inputs_or_constants():
+    program = trace(lambda p, x: jnp.stack([x[1], p[0], 2.0, x[1] * p[0]]), (1,), (2,))
+    x = np.random.default_rng(0).normal(size=(5, 2))
+    p = np.array([3.0])
+    found = in_kernel(program, p, x, interpret=True)
+    expected = np.stack([x[:, 1], np.full(5, 3.0), np.full(5, 2.0), 3.0 * x[:, 1]], 1)
+    np.testing.assert_array_equal(found, expected)
+
+
 def test_no_samples(on_gpu):
     p, *arrays = numbers(ARM, 0)
     assert jax.jit(lambda *x: ARM.inverse_dynamics(*x))(p, *arrays).shape == (0, 2)
