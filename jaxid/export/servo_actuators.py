@@ -203,7 +203,12 @@ def _compare_gain(fit: ServoFit, name: str, joint: int) -> Remark:
     texts = with_deviation(estimate, deviation)
     result = "agrees" if agrees else "differs"
     status = Status.GOOD if agrees else Status.DOUBTFUL
-    return Remark(f"{text}, estimated {' ± '.join(texts)}: {result}", status)
+    text = f"{text}, estimated {' ± '.join(texts)}: {result}"
+    if is_stiffness and ratio > high:
+        # A servo under less gravity sags as little as a stiffer one.
+        share = 100.0 * (1.0 - gain / estimate)
+        text = f"{text}, or the controller cancels {share:.0f} % of the gravity"
+    return Remark(text, status)
 
 
 def export_servo_mjcf(

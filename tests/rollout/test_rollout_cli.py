@@ -112,7 +112,8 @@ contacts = { short_1 = [[4.0, 6.0]] }"""
     )
     # The second joint has 15.
     assert re.match(
-        r"stiffness of lift 11 N m/rad, estimated 1[45]\.\d+ ± 0\.\d+: differs",
+        r"stiffness of lift 11 N m/rad, estimated 1[45]\.\d+ ± 0\.\d+: differs, or "
+        r"the controller cancels 2\d % of the gravity",
         others[0],
     )
     assert re.match(r"damping of turn 0.5 N m s/rad, .*: agrees", others[1])
