@@ -1,6 +1,6 @@
 """Least squares of a nonlinear function, within bounds; batched by `jax.vmap`."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
 
 import jax
@@ -64,6 +64,41 @@ def minimise_squares(
     has_converged = solution.result == optx.RESULTS.successful
     end = solution.stats["end"]
     return Minimum(solution.value, has_converged, end.residuals, end.jacobian)
+
+
+def search_squares(
+    residuals: Residuals,
+    start: Float[AnyArray, " unknowns"],
+    lower: AnyArray | float = -jnp.inf,
+    upper: AnyArray | float = jnp.inf,
+    *,
+    args: Any = None,
+    rtol: float = 1e-8,
+) -> Iterator[Minimum]:
+    """Yield the best unknowns after each step of a search that takes long.
+
+    Unlike `minimise_squares` it can show progress and be interrupted. The arguments are
+    the same.
+    """
+    solver = BoundedLevenbergMarquardt(rtol=rtol)
+    options = {"lower": jnp.asarray(lower), "upper": jnp.asarray(upper)}
+
+    def function(x: Array, args: Any) -> tuple[Array, None]:
+        return residuals(x, args), None
+
+    @jax.jit
+    def step(x: Array, args: Any, state: _Linearisation) -> Any:
+        return solver.step(function, x, args, options, state, frozenset())[:2]
+
+    x = jnp.clip(jnp.asarray(start), lower, upper)
+    rows = jax.eval_shape(residuals, x, args)
+    state = solver.init(function, x, args, options, rows, None, frozenset())
+    has_ended = False
+    while not has_ended:
+        x, state = step(x, args, state)
+        end, _ = solver.terminate(function, x, args, options, state, frozenset())
+        has_ended = bool(end)
+        yield Minimum(x, end, state.residuals, state.jacobian)
 
 
 class _Linearisation(NamedTuple):

@@ -1,5 +1,8 @@
 """The choice of a model: planted effects are found, and the user's file is kept."""
 
+import re
+import time
+
 import numpy as np
 import pytest
 
@@ -115,12 +118,14 @@ def test_keys_are_set_and_all_else_is_kept(text, lines):
 
 
 def test_progress_without_a_terminal_is_a_line_now_and_then(monkeypatch, capsys):
-    now = [100.0]
-    monkeypatch.setattr(terminal.time, "monotonic", lambda: now[0])
+    monkeypatch.setattr(terminal, "LINE_INTERVAL", 0.1)
     with terminal.progress_bar() as progress:
-        for step in range(5):
-            progress("measuring errors", step / 10)
-            now[0] += 4.0
+        progress("measuring errors", 0.0)
+        progress("measuring errors", 0.3)
+        # The stage says nothing for as long as it compiles.
+        time.sleep(0.5)
     lines = capsys.readouterr().err.splitlines()
-    # Other stages follow: this one is four fifths of the whole.
-    assert lines == ["measuring errors: 27 %, about 32 s left"]
+    assert len(lines) >= 2
+    # Other stages follow: this one is nine tenths of the whole.
+    for line in lines:
+        assert re.fullmatch(r"measuring errors: 27 %, about \d+ s left", line)

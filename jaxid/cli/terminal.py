@@ -3,6 +3,7 @@
 import contextlib
 import errno
 import re
+import threading
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
@@ -126,27 +127,43 @@ def progress_bar() -> Iterator[Progress]:
     bar = Bar(SpinnerColumn(), *columns, console=console, transient=True)
     bar.add_task("starting", total=1.0)
     (task,) = bar.tasks
-    is_silent = not console.is_terminal
-    with contextlib.nullcontext() if is_silent else bar:
-        stage_start = stage_fraction = 0.0
-        start_time = line_time = time.monotonic()
+    stage_start = stage_fraction = 0.0
 
-        def show_stage(stage: str, fraction: float) -> None:
-            nonlocal stage_start, stage_fraction, line_time
-            if fraction < stage_fraction:
-                stage_start = task.completed
-            stage_fraction = fraction
-            part = LONG_PART if LONG_STAGES.search(stage) else SHORT_PART
-            share = stage_start + part * (1.0 - stage_start) * fraction
-            bar.update(task.id, description=stage, completed=share)
-            now = time.monotonic()
-            if is_silent and now - line_time >= LINE_INTERVAL:
-                line_time = now
-                time_left = (now - start_time) * (1.0 / max(share, 0.02) - 1.0)
-                words = f"{stage}: {100 * share:.0f} %, about {time_left:.0f} s left"
-                console.print(Text(words))
+    def show_stage(stage: str, fraction: float) -> None:
+        nonlocal stage_start, stage_fraction
+        if fraction < stage_fraction:
+            stage_start = task.completed
+        stage_fraction = fraction
+        part = LONG_PART if LONG_STAGES.search(stage) else SHORT_PART
+        share = stage_start + part * (1.0 - stage_start) * fraction
+        bar.update(task.id, description=stage, completed=share)
 
+    if console.is_terminal:
+        with bar:
+            yield show_stage
+        return
+    end = threading.Event()
+    # A thread: some stages compile for longer than ten seconds.
+    printer = threading.Thread(
+        target=_print_lines, args=(console, task, end), daemon=True
+    )
+    printer.start()
+    try:
         yield show_stage
+    finally:
+        end.set()
+        printer.join()
+
+
+def _print_lines(console: Console, task: Any, end: threading.Event) -> None:
+    """Print a line of progress each ten seconds until the end."""
+    start_time = time.monotonic()
+    while not end.wait(LINE_INTERVAL):
+        share = task.completed
+        elapsed_time = time.monotonic() - start_time
+        time_left = elapsed_time * (1.0 / max(share, 0.02) - 1.0)
+        words = f"{task.description}: {100 * share:.0f} %, about {time_left:.0f} s left"
+        console.print(Text(words))
 
 
 def describe_error(error: Exception) -> str:

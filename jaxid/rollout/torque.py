@@ -8,6 +8,7 @@ horizon count.
 
 import dataclasses
 import functools
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
@@ -18,14 +19,13 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Vector, double_precision
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.projection_equation import solve_symmetric
 from jaxid.dynamics.sample_methods import program_of
 from jaxid.dynamics.terms import HardSign
 from jaxid.errors import InputError
 from jaxid.identification.identify import identify
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.blocks import block_covariance
-from jaxid.least_squares import Minimum, minimise_squares
+from jaxid.least_squares import Minimum, search_squares
 from jaxid.measurement.observations import Observations
 from jaxid.program.xla import lower
 from jaxid.result_table import Column, Summarised, Table, estimate_columns
@@ -44,6 +44,8 @@ WEIGHTS = (1.0 / 6.0, 1.0 / 3.0, 1.0 / 3.0, 1.0 / 6.0)
 """Weights of the stages in a step."""
 MAX_DERIVATIVES = 4_000_000
 """Largest number of derivatives of positions; they take 32 MB."""
+MAX_STEPS = 50
+"""Largest number of steps of the search."""
 BLOCKS = 40
 """Contiguous parts of the logs whose scatter gives the uncertainty."""
 
@@ -186,7 +188,7 @@ class TorqueRollout:
         @jax.custom_jvp
         def acceleration(p: Array, q: Array, qd: Array, torques: Array) -> Any:
             bias = forces_of(p, q, qd, jnp.zeros_like(q))
-            return solve_symmetric(inertia_of(p, q), torques - bias)
+            return _solve_mass_matrix(inertia_of(p, q), torques - bias)
 
         @acceleration.defjvp
         def derivative(primals: Any, tangents: Any) -> Any:
@@ -195,9 +197,22 @@ class TorqueRollout:
             _, change = jax.jvp(
                 lambda *x: forces_of(*x, qdd), (p, q, qd), tuple(tangents[:3])
             )
-            return qdd, solve_symmetric(inertia_of(p, q), tangents[3] - change)
+            return qdd, _solve_mass_matrix(inertia_of(p, q), tangents[3] - change)
 
         return acceleration
+
+
+def _solve_mass_matrix(inertia: Array, forces: Array) -> Array:
+    """Return the accelerations by forces [joints, windows].
+
+    Args:
+        inertia: Mass matrices [joints, joints, windows].
+        forces: Forces [joints, windows].
+    """
+    # Written out for its entries, XLA would compute the factors again for each use.
+    factor = jnp.linalg.cholesky(jnp.moveaxis(inertia, -1, 0))
+    columns = forces.T[..., None]
+    return jax.scipy.linalg.cho_solve((factor, True), columns)[..., 0].T
 
 
 @dataclasses.dataclass(frozen=True)
@@ -210,6 +225,7 @@ class TorqueRolloutFit(Summarised):
         uncertainty: Uncertainty of these, from the scatter of parts of the logs.
         horizon: Horizon of the windows [s].
         start: Base parameters of the fit of torques from which the search started.
+        converged: Whether the search ended by itself; Ctrl-C ends it before.
     """
 
     rollout: TorqueRollout
@@ -217,6 +233,7 @@ class TorqueRolloutFit(Summarised):
     uncertainty: Uncertainty
     horizon: float
     start: Vector
+    converged: bool
 
     @property
     def names(self) -> list[str]:
@@ -303,18 +320,23 @@ class TorqueRolloutFit(Summarised):
 
 
 def identify_torque_rollout(
-    base: BaseParameters, observations: Logs, *, horizon: float = 0.2
+    base: BaseParameters,
+    observations: Logs,
+    *,
+    horizon: float = 0.2,
+    progress: Callable[[str, float], None] | None = None,
 ) -> TorqueRolloutFit:
     """Identify a robot whose simulation under recorded torques follows the positions.
 
     The search starts from the fit of torques. Windows overlap, by four fifths if the
-    robot is small. A gain
-    common to all torques scales all parameters, and no log tells it.
+    robot is small. A gain common to all torques scales all parameters, and no log tells
+    it. Ctrl-C ends the search with the best so far.
 
     Args:
         base: Base parameters of the model; dry friction must be smooth.
         observations: Filtered logs with torques.
         horizon: Length of the windows [s].
+        progress: Callback, called with a stage and its completed fraction (0 to 1).
 
     Raises:
         InputError: If there is no window of the horizon, or the model cannot be
@@ -337,15 +359,25 @@ def identify_torque_rollout(
         errors = rollout.errors(unknowns, windows)
         return errors[COUNTED_STEP - 1 :: COUNTED_STEP].ravel()
 
+    search = search_squares(residuals, start, -limits, limits, args=windows, rtol=1e-5)
+    minimum = None
     with double_precision():
-        minimum = minimise_squares(
-            residuals, start, -limits, limits, args=windows, rtol=1e-5, max_steps=50
-        )
+        try:
+            for count, trial in enumerate(itertools.islice(search, MAX_STEPS), 1):
+                minimum = trial
+                if progress is not None:
+                    progress("best so far of a search", count / MAX_STEPS)
+        except KeyboardInterrupt:
+            if minimum is None:
+                raise
     errors = np.asarray(minimum.residuals).reshape(-1, *windows.q.shape)
     blocks = windows.starts * BLOCKS // (windows.starts.max() + 1)
     uncertainty = _uncertainty(minimum, np.broadcast_to(blocks, errors.shape).ravel())
     unknowns = np.asarray(minimum.x)
-    return TorqueRolloutFit(rollout, unknowns, uncertainty, horizon, torque_fit)
+    converged = bool(minimum.converged)
+    return TorqueRolloutFit(
+        rollout, unknowns, uncertainty, horizon, torque_fit, converged
+    )
 
 
 def _require_stable_simulation(

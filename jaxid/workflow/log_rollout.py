@@ -188,10 +188,15 @@ def _follow_torques(
     training_logs = observations[: len(sources["fit"])]
     unseen_logs = observations[len(training_logs) :]
     progress("identifying", 0.0)
-    fit = identify_torque_rollout(base, training_logs, horizon=settings.horizon)
+    fit = identify_torque_rollout(
+        base, training_logs, horizon=settings.horizon, progress=progress
+    )
     progress("simulating", 0.0)
     errors = fit.validate(unseen_logs or training_logs)
     findings = [Remark(note) for note in setup.notes]
+    if not fit.converged:
+        text = "the search was stopped before its end: these are the best values so far"
+        findings.append(Remark(text, Status.DOUBTFUL))
     for log in loaded_logs:
         findings += [Remark(text, Status.DOUBTFUL) for text in log.findings]
         findings += [Remark(note) for note in log.observations.notes]

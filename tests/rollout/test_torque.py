@@ -121,3 +121,16 @@ def test_what_cannot_be_simulated_is_rejected(base, logs):
             jid.rollout.identify_torque_rollout(jid.base_parameters(model), logs[0])
     with pytest.raises(jid.InputError, match="`observations`"):
         jid.rollout.identify_torque_rollout(base, logs[0], horizon=100.0)
+
+
+def test_an_interrupted_search_ends_with_the_best_so_far(base, logs, fit):
+    def interrupt(stage, fraction):
+        raise KeyboardInterrupt
+
+    best = jid.rollout.identify_torque_rollout(
+        base, logs[0], horizon=0.1, progress=interrupt
+    )
+    assert not best.converged
+    assert fit.converged
+    # Only the first step was done, which linearises at the fit of torques.
+    np.testing.assert_allclose(best.parameters, best.start)
