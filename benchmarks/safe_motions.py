@@ -27,6 +27,7 @@ other programs on the machine do not matter: they are those of an idle machine.
 """
 
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
@@ -85,6 +86,7 @@ def design(folder: Path, seconds: float, *more: str) -> dict[str, float]:
         )
         while process.poll() is None:
             if not first and (folder / "motion.json").exists():
+                shutil.copy(folder / "motion.json", folder / "first.json")
                 first = {
                     "first": time.monotonic() - start,
                     "first CPU": cpu(process.pid),

@@ -7,6 +7,7 @@ import dataclasses
 import io
 import sys
 from pathlib import Path
+from time import monotonic
 from typing import Annotated, Literal
 
 import typer
@@ -145,6 +146,7 @@ def excite(
     at the end also a page with pictures. Ctrl-C keeps the best motion so far. The exit
     code is 3 if something was not checked.
     """
+    start_time = monotonic()
     options.require_table_name(output)
     earlier_design = output.with_suffix(".json") if resume else None
     if earlier_design is not None and not earlier_design.is_file():
@@ -160,11 +162,17 @@ def excite(
         task = jid.workflow.prepare_motion(
             content.setup, content.excitation, content.surroundings, earlier_design
         )
+    seconds = content.excitation.time if time is None else time
+    if seconds is not None:
+        # What was read and prepared counts, too.
+        seconds -= monotonic() - start_time
     faults = [Remark(text, Status.BAD) for text in task.faults]
     terminal.show_remarks(terminal.open_console(stderr=True), faults)
     with BestMotion(task, output) as best_motion, terminal.progress_bar() as progress:
         with within("excitation", experiment.name):
-            design = jid.workflow.design_motion(task, progress, best_motion.keep, time)
+            design = jid.workflow.design_motion(
+                task, progress, best_motion.keep, seconds
+            )
         progress("writing the report", 0.0)
         origin = options.report_origin(content.text)
         files = jid.workflow.write_design(task, design, output, **origin)

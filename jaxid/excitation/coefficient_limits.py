@@ -78,14 +78,17 @@ class Grid(NamedTuple):
         positions = self._measure(y).positions
         return self._scale(y, positions, np.full(len(positions), factor), np.inf)
 
-    def fill(self, y: ScaledMotion, places: PerJoint, size: float) -> np.ndarray:
+    def fill(
+        self, y: ScaledMotion, places: PerJoint, size: PerJoint | float
+    ) -> np.ndarray:
         """Return a motion of the same shape that fills a fraction of all limits.
 
         Args:
             y: Motion whose shape is kept.
             places: Where each joint moves within its range: 0 at the lower, 1 at the
                 upper end.
-            size: Size of the motion; at 1 each joint uses 95 % of a limit.
+            size: Size of the motion, or of that of each joint; at 1 it uses 95 % of a
+                limit.
         """
         bound = FILLED_FRACTION * self.bound
         positions, use = self._measure(y)
@@ -244,11 +247,12 @@ class JointLimits(eqx.Module):
     def random(self, key: PRNGKeyArray, count: int) -> ScaledMotions:
         """Draw motions of random shapes that use 95 % of the limits."""
         joints, variables = self.shape
-        shape_key, place_key = jax.random.split(key)
-        shapes = jax.random.normal(shape_key, (count, joints * variables), float)
-        places = jax.random.uniform(place_key, (count, joints), float)
+        # In NumPy: the first draw of JAX would wait for its compiler.
+        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+        shapes = random.standard_normal((count, joints * variables))
+        places = random.random((count, joints))
         grid = self.grid()
-        pairs = zip(np.asarray(shapes), np.asarray(places), strict=True)
+        pairs = zip(shapes, places, strict=True)
         return np.array([grid.fill(shape, place, 1.0) for shape, place in pairs])
 
 

@@ -28,7 +28,8 @@ from .feasible_candidates import (
     shrink_to_constraints,
 )
 from .problem import ExcitationProblem
-from .search import count_steps, first_motions, search
+from .random_feasible_motions import random_feasible_motions
+from .search import count_steps, search
 
 Solver = Callable[[ExcitationProblem, ScaledMotions], AnyArray]
 """A solver of excitation problems: from random motions to better ones."""
@@ -38,6 +39,8 @@ SEARCH_SHARE = 0.65
 """Share of a limited time after which only the limits are kept more closely."""
 MIN_IMPROVEMENT = 2e-3
 """Relative improvement in the last quarter of the steps of a converged design."""
+MIN_DURATION = 1e-3
+"""Duration of a search whose time was over before it began [s]."""
 MAX_SHRUNK = 4
 """Motions that are made smaller where none keeps all constraints."""
 
@@ -73,6 +76,7 @@ def design_excitation(
     noise: JointVector | None = None,
     prior: BaseMatrix | None = None,
     samples: int = 800,
+    seconds: float | None = None,
     **settings: Any,
 ) -> ExcitationPlan:
     r"""Find the motion that determines base parameters best within limits (Eq. 36).
@@ -98,8 +102,10 @@ def design_excitation(
         prior: Information of earlier experiments in the same noise, the inverse of
             their covariance; the design adds to it.
         samples: Number of measured samples of one run of the motion.
+        seconds: Time after which the best motion so far is returned, counted from this
+            call, with all that is compiled [s]; None for all steps.
         settings: Arguments of `minimise`: `solver`, `starts`, `generations`, `key`,
-            `progress`, `begin`, `seconds`, `throw`.
+            `progress`, `begin`, `throw`.
 
     Raises:
         InputError: If arguments do not fit, or no motion keeps all constraints: the
@@ -107,6 +113,7 @@ def design_excitation(
         KeyboardInterrupt: If Ctrl-C came before a motion kept all constraints.
         RuntimeError: If JAX runs in single precision.
     """
+    start_time = time.monotonic()
     basis = FourierBasis(harmonics, omega) if basis is None else basis
     problem = ExcitationProblem(
         base,
@@ -118,7 +125,9 @@ def design_excitation(
         prior=prior,
         samples=samples,
     )
-    return minimise(problem, **settings)
+    if seconds is not None:
+        seconds -= time.monotonic() - start_time
+    return minimise(problem, seconds=seconds, **settings)
 
 
 def minimise(
@@ -167,13 +176,16 @@ def minimise(
             raise InputError(f"`{name}` must be at least {minimum}, but is {value}.")
     if begin is not None and begin.coefficients.shape != problem.limits.shape:
         raise InputError("`begin` must be a motion of the problem's basis.")
+    start_time = time.monotonic()
     key = jax.random.key(0) if key is None else key
     x = problem.limits.random(key, starts)
     values = criterion_values(problem, x)
     median_motion = x[np.argsort(values)[starts // 2]]
     if solver is None:
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
-        outcome = _run_search(problem, x, begin, generations, random, seconds, progress)
+        duration = math.inf if seconds is None else max(seconds, MIN_DURATION)
+        clock = Clock(start_time, duration)
+        outcome = _run_search(problem, x, begin, generations, random, clock, progress)
     else:
         outcome = _run_solver(problem, x, solver)
     motion = outcome.candidates.best_motion
@@ -198,6 +210,13 @@ def minimise(
             )
         raise InputError(f"no motion was found that keeps all limits: {excess}")
     return plan
+
+
+class Clock(NamedTuple):
+    """Time of a search."""
+
+    start_time: float  # time of `time.monotonic` [s]
+    duration: float  # time after which it ends; infinite for all steps [s]
 
 
 class Outcome(NamedTuple):
@@ -225,15 +244,13 @@ def _run_search(
     begin: LinearTrajectory | None,
     generations: int,
     random: np.random.Generator,
-    seconds: float | None,
+    clock: Clock,
     progress: Callable[[DesignProgress], None] | None,
 ):
     """Do all steps of a search, or those until the time is over or Ctrl-C."""
-    start_time = time.monotonic()
-    duration = math.inf if seconds is None else seconds
-    deadline = start_time + SEARCH_SHARE * duration
+    deadline = clock.start_time + SEARCH_SHARE * clock.duration
     if problem.constraints:
-        x = first_motions(problem, random, x)
+        x = random_feasible_motions(problem, random, len(x)).x
     if begin is not None:
         x[0] = problem.limits.scaled(begin.coefficients)
     # With constraints the search looks for one motion that keeps them first.
@@ -244,11 +261,11 @@ def _run_search(
         for step in search(problem, x, candidates, generations, random, deadline):
             candidates = step.candidates
             history.append(candidates.best_value)
-            elapsed_time = time.monotonic() - start_time
+            elapsed_time = time.monotonic() - clock.start_time
             if progress is not None:
                 fraction = (len(history) - 1) / steps
-                if seconds is not None:
-                    fraction = elapsed_time / seconds
+                if math.isfinite(clock.duration):
+                    fraction = elapsed_time / clock.duration
                 fraction = min(fraction, 1.0)
                 trajectory = problem.trajectory(candidates.best_motion)
                 value = candidates.best_value
@@ -261,7 +278,7 @@ def _run_search(
                         trajectory,
                     )
                 )
-            if elapsed_time > duration and candidates.is_feasible:
+            if elapsed_time > clock.duration and candidates.is_feasible:
                 break
     except KeyboardInterrupt:
         return Outcome(candidates, history, DesignStatus.STOPPED)

@@ -2,8 +2,6 @@
 
 from typing import Any, NamedTuple
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
@@ -17,8 +15,8 @@ EXCESS_PENALTY = 3.0
 """Penalty of a relative excess, added to the criterion's logarithm."""
 SLIGHT_SHRINKAGES = (0.9995, 0.998, 0.995, 0.99, 0.98, 0.96, 0.93, 0.9)
 """Factors by which a motion is made smaller that exceeds its constraints a little."""
-SHRINKAGE_STEP = 0.05
-"""Step of the factors by which a motion is made smaller."""
+HALVINGS = 10
+"""Bisections of the factor by which a motion is made smaller."""
 SAME_VALUE = 2e-5
 """Difference of two criteria's logarithms below which motions are the same."""
 
@@ -92,8 +90,12 @@ def criterion_values(problem: ExcitationProblem, x: ScaledMotions) -> PerStart:
     """Return the exact logarithms of the criterion."""
     values = []
     for motion in x:
-        information = jax.tree.map(jnp.asarray, problem.information(motion))
-        values.append(float(problem.criterion(information)))
+        information = problem.information(motion)
+        # The function that a search compiles in any case.
+        value, _ = problem.criterion_and_slopes(
+            information.plain, information.weighted, None
+        )
+        values.append(float(value))
     return np.array(values)
 
 
@@ -137,22 +139,16 @@ def _shrink_slightly(
 
 def shrink_to_constraints(problem: ExcitationProblem, x: ScaledMotion) -> Candidates:
     """Return a motion so small that it keeps all constraints, if any size does."""
-    x = np.asarray(x)
+    motion = np.asarray(x)
     grid = problem.limits.grid()
-
-    def is_kept(factor):
-        return problem.excess(grid.shrink(x, factor)) <= 0.0
-
-    factors = np.arange(1.0 - SHRINKAGE_STEP, 0.0, -SHRINKAGE_STEP)
-    factor = next((factor for factor in factors if is_kept(factor)), None)
-    if factor is None:
-        return evaluate(problem, x[None])
-    # Bisection: the largest factor lies between the one found and the step above it.
-    upper_bound = factor + SHRINKAGE_STEP
-    for _ in range(6):
-        middle_factor = 0.5 * (factor + upper_bound)
-        if is_kept(middle_factor):
-            factor = middle_factor
+    low = 0.0
+    high = 1.0
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        smaller_motion = grid.shrink(x, middle)
+        if problem.excess(smaller_motion) <= 0.0:
+            low = middle
+            motion = smaller_motion
         else:
-            upper_bound = middle_factor
-    return evaluate(problem, grid.shrink(x, factor)[None])
+            high = middle
+    return evaluate(problem, motion[None])

@@ -2,8 +2,8 @@
 
 The children of the motions found are improved in the same way, and of parents and
 children the best survive. In the end limits are kept on a finer grid, so that less of
-them is left unused. Where there are constraints, all starts are small motions that keep
-them, so that there is a result after seconds.
+them is left unused. Where there are constraints, all starts are random motions that
+keep them, so that there is a result after seconds.
 """
 
 import math
@@ -13,8 +13,6 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
-
-from jaxid.dynamics.motion import Motion
 
 from . import interior_point
 from .coefficient_limits import ScaledMotions, scale_samples
@@ -74,10 +72,6 @@ BATCH = 8
 """Starts that are improved together."""
 PART = 25
 """Iterations of one step, after which the peaks of constraints are found anew."""
-POSES = 1000
-"""Random poses among which those are looked for that keep all constraints."""
-FIRST_SIZES = (0.6, 0.4, 0.3, 0.2, 0.15, 0.1, 0.05)
-"""Sizes of first motions about such poses, relative to the limits of the joints."""
 CHILD_TRIES = 16
 """Children of each motion of which the most promising is improved."""
 
@@ -302,46 +296,6 @@ def _take(
     return candidates.improved(places, evaluate_within_limits(problem, x))
 
 
-def _feasible_places(
-    problem: ExcitationProblem,
-    random: np.random.Generator,
-    count: int,
-):
-    """Return random places in the joints' ranges that keep constraints best."""
-    limits = problem.limits.limits
-    low = np.asarray(limits.position_min)
-    high = np.asarray(limits.position_max)
-    places = random.uniform(0.1, 0.9, (POSES, len(low)))
-    q = low + places * (high - low)
-    standstill = Motion(q, np.zeros_like(q), np.zeros_like(q))
-    excess = np.full(POSES, -np.inf)
-    for constraint in problem.constraints:
-        values = np.asarray(constraint(problem.robot, standstill))
-        excess = np.maximum(excess, values.max(axis=1))
-    return places[np.argsort(excess)[:count]]
-
-
-def first_motions(
-    problem: ExcitationProblem,
-    random: np.random.Generator,
-    x: ScaledMotions,
-) -> ScaledMotions:
-    """Return small motions that keep the constraints, the largest first.
-
-    They have the shapes of given motions, about poses at which the robot may stand
-    still.
-    """
-    places = _feasible_places(problem, random, len(x))
-    grid = problem.limits.grid()
-    motions = []
-    for size in FIRST_SIZES:
-        for motion, place in zip(x, places, strict=True):
-            motions.append(grid.fill(motion, place, size))
-    violation = [max(watched_excess(problem, motion), 0.0) for motion in motions]
-    order = np.argsort(violation, kind="stable")
-    return np.array(motions)[order[: len(x)]]
-
-
 def crossover(
     problem: ExcitationProblem,
     x: ScaledMotions,
@@ -363,7 +317,7 @@ def crossover(
         children = _draw_children(problem, retimings, x, random)
         values, _ = value_and_gradient(problem, children, None, samples)
         if problem.constraints:
-            excess = np.array([watched_excess(problem, child) for child in children])
+            excess = watched_excess(problem, children)
             values = values + EXCESS_PENALTY * np.maximum(excess, 0.0)
         is_better = values < best_values
         next_motions[is_better] = children[is_better]

@@ -48,7 +48,8 @@ def watch(problem: ExcitationProblem, x: ScaledMotion) -> list[WatchedValues]:
         is_peak = is_above_next & (values >= np.roll(values, 1, axis=0))
         heights = np.where(is_peak, values, -np.inf)
         # A constraint with fewer values repeats them.
-        peak_places = np.argsort(heights, axis=None)[-PEAKS:]
+        count = min(PEAKS, heights.size)
+        peak_places = np.argpartition(heights, -count, axis=None)[-count:]
         peak_places = np.resize(peak_places, PEAKS)
         peak_rows, peak_entries = np.unravel_index(peak_places, values.shape)
         instants = COARSE_STEP * np.concatenate([rows, peak_rows])
@@ -58,10 +59,23 @@ def watch(problem: ExcitationProblem, x: ScaledMotion) -> list[WatchedValues]:
     return watched_values
 
 
-def watched_excess(problem: ExcitationProblem, x: ScaledMotion) -> float:
-    """Return the largest excess of the constraints at equidistant instants."""
-    values = problem.constraint_values(x, WATCHED_INSTANTS)
-    return max((float(excess.max()) for excess in values), default=-np.inf)
+def watched_excess(
+    problem: ExcitationProblem,
+    x: ScaledMotions,
+    instants: np.ndarray = WATCHED_INSTANTS,
+) -> np.ndarray:
+    """Return the largest excess of the constraints of each motion at some instants."""
+    motions = len(x)
+    rows = problem.checked_rows[:, instants]
+    coefficients = problem.limits.coefficients(x)
+    states = np.einsum("owk,bjk->obwj", rows, coefficients, optimize=True)
+    q, qd, qdd = states.reshape(3, motions * len(instants), -1)
+    excess = np.full(motions, -np.inf)
+    for constraint in problem.constraints:
+        values = np.asarray(constraint(problem.robot, Motion(q, qd, qdd)))
+        highest_values = values.reshape(motions, -1).max(axis=1)
+        excess = np.maximum(excess, highest_values)
+    return excess
 
 
 def linearise(

@@ -162,20 +162,59 @@ class CollisionModel(Hashable):
         return clearances.reshape(*batch, len(self.groups))
 
     @eqx.filter_jit
+    def gaps(self, ends: Array) -> Array:
+        """Return the gap of each pair [samples, pairs] for given ends of all axes [m].
+
+        Args:
+            ends: Ends of all axes on the ground [samples, capsules, 2, 3] [m].
+        """
+        return jax.vmap(self._gaps)(ends)
+
+    def least_of_groups(self, gaps: np.ndarray) -> np.ndarray:
+        """Return the clearances [samples, groups] from the gaps of all pairs."""
+        order = np.concatenate(self.groups)
+        sizes = [len(group) for group in self.groups]
+        first_places = np.cumsum([0, *sizes[:-1]])
+        return np.minimum.reduceat(gaps[:, order], first_places, axis=1)
+
+    @eqx.filter_jit
     def linearised_clearances(self, ends: Array, places: Array) -> tuple[Array, Array]:
         """Return one clearance of each sample [m], and its derivatives by the ends.
+
+        Only the pairs of that clearance are computed.
 
         Args:
             ends: Ends of all axes on the ground [samples, capsules, 2, 3] [m].
             places: Place of each sample's clearance among the groups.
         """
+        size = max(map(len, self.groups))
+        pair_places = np.array([np.resize(group, size) for group in self.groups])
+        pairs_of_groups = jnp.asarray(np.array(self.pairs)[pair_places])
 
-        def clearance(ends):
-            gaps = self.clearances(ends)
-            return jnp.take_along_axis(gaps, places[:, None], axis=1)[:, 0]
+        def clearance(ends, pairs):
+            gaps = self._gaps_of_pairs(ends, pairs)
+            nearest_pair = jnp.argmin(jax.lax.stop_gradient(gaps))
+            return gaps[nearest_pair]
 
-        gaps, pull = jax.vjp(clearance, ends)
-        return gaps, *pull(jnp.ones_like(gaps))
+        linearise = jax.vmap(jax.value_and_grad(clearance))
+        return linearise(ends, pairs_of_groups[places])
+
+    def _gaps_of_pairs(self, ends: Array, pairs: Array):
+        """Return the gaps of some pairs [pairs, 2], which differ between samples."""
+        radii = jnp.stack([jnp.asarray(capsule.radius) for capsule in self.capsules])
+        last_capsule = len(self.capsules) - 1
+        axes = ends[pairs[:, 0]]
+        second_shapes = pairs[:, 1]
+        second_capsules = jnp.minimum(second_shapes, last_capsule)
+        second_axes = ends[second_capsules]
+        distances = segment_distance(
+            axes[:, 0], axes[:, 1], second_axes[:, 0], second_axes[:, 1]
+        )
+        distances = distances - radii[second_capsules]
+        for number, obstacle in enumerate(self.obstacles, len(self.capsules)):
+            distance = obstacle.distance(axes[:, 0], axes[:, 1])
+            distances = jnp.where(second_shapes == number, distance, distances)
+        return distances - radii[pairs[:, 0]]
 
     def _gaps(self, ends: Array):
         """Return the distance between the surfaces of each pair for some `ends` [m]."""

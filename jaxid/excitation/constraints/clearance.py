@@ -47,12 +47,13 @@ class Clearance(AbstractConstraint):
             gaps = self.model.clearances(ends)
             return (jnp.broadcast_to(self.distances, gaps.shape) - gaps) / SIZE
 
-        def clearances(ends):
-            return (self.model.clearances(ends),)
+        def gaps_of_pairs(ends):
+            return (self.model.gaps(ends),)
 
         *batch, capsules, _, _ = ends.shape
         samples = ends.reshape(-1, capsules, 2, 3)
-        (gaps,) = in_blocks(clearances, samples)
+        (pair_gaps,) = in_blocks(gaps_of_pairs, samples)
+        gaps = self.model.least_of_groups(pair_gaps)
         return (self.distances - gaps.reshape(*batch, -1)) / SIZE
 
     def _ends(self, robot: Robot, q: AnyArray):

@@ -1,0 +1,159 @@
+"""Random motions that keep all limits, of which a search starts with the best.
+
+A motion of a random shape about a pose at which the robot may stand still is made as
+large as the constraints allow. Many are drawn and checked together: that takes less
+time than the first steps of a search, and no design is worse than the best of them.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import Float
+from jaxid.dynamics.motion import Motion
+
+from .coefficient_limits import FILLED_FRACTION, Grid, ScaledMotions
+from .criterion_gradient import value_and_gradient
+from .feasible_candidates import Candidates
+from .problem import MARGIN, SEARCH_SAMPLES, WATCHED_INSTANTS, ExcitationProblem
+from .watched_constraints import watched_excess
+
+Poses = Float[np.ndarray, "poses joints"]
+"""Places of poses within the ranges of the joints, from 0 to 1."""
+Sizes = Float[np.ndarray, "motions joints"]
+"""Sizes of motions relative to the limits of the joints."""
+
+DRAWS_PER_START = 2
+"""Random motions that are drawn for each start; the best of them are taken."""
+POSES = 1000
+"""Random poses of one round."""
+MAX_ROUNDS = 20
+"""Rounds in which poses are looked for that keep all constraints."""
+POSE_SPREAD = 0.05
+"""Standard deviation of poses near good ones, relative to the joints' ranges."""
+MIN_POSE_ROOM = 0.05
+"""Relative distance from all constraints that a pose should have, to move about it."""
+MIN_SIZE = 1e-3
+"""Size of a motion that is almost at rest, relative to the limits of the joints."""
+HALVINGS = 7
+"""Bisections of the logarithm of a size; then it is found to 6 %."""
+INSTANTS_OF_JOINTS = WATCHED_INSTANTS[::4]
+"""Instants at which joints are tried alone, which needs not be exact."""
+
+
+class Draws(NamedTuple):
+    """Random shapes of motions, each about a pose."""
+
+    grid: Grid  # limits of the joints
+    shapes: ScaledMotions
+    places: Poses
+
+    def motions(self, sizes: Sizes) -> ScaledMotions:
+        """Return the motions of these sizes."""
+        parts = zip(self.shapes, self.places, sizes, strict=True)
+        return np.array([self.grid.fill(*part) for part in parts])
+
+
+def random_feasible_motions(
+    problem: ExcitationProblem, random: np.random.Generator, count: int
+) -> Candidates:
+    """Return random motions as large as the constraints allow, the best first.
+
+    Values and constraints are those at few samples and instants.
+
+    Args:
+        problem: Problem with constraints.
+        random: Generator of poses and shapes.
+        count: Number of motions.
+    """
+    number = DRAWS_PER_START * count
+    places = _standing_poses(problem, random, number)
+    shapes = random.standard_normal((number, problem.size))
+    x = _enlarge(problem, Draws(problem.limits.grid(), shapes, places))
+    values, _ = value_and_gradient(problem, x, None, SEARCH_SAMPLES)
+    motions = Candidates(x, values, watched_excess(problem, x) + MARGIN)
+    return motions.at(motions.order()[:count])
+
+
+def _standing_poses(
+    problem: ExcitationProblem, random: np.random.Generator, count: int
+) -> Poses:
+    """Return poses that keep the constraints, or come nearest to it, the best first.
+
+    After the first round half of the poses are drawn near the best ones: the poses that
+    keep all constraints may be one in many thousands.
+    """
+    joints, _ = problem.limits.shape
+    places = np.zeros((0, joints))
+    next_places = random.uniform(0.1, 0.9, (POSES, joints))
+    for _ in range(MAX_ROUNDS):
+        all_places = np.concatenate([places, next_places])
+        excess = _excess_at_rest(problem, all_places)
+        order = np.argsort(excess, kind="stable")[:count]
+        places = all_places[order]
+        if excess[order[-1]] <= -MIN_POSE_ROOM:
+            break
+        neighbours = places[random.integers(0, len(places), POSES // 2)]
+        steps = POSE_SPREAD * random.standard_normal(neighbours.shape)
+        near_places = np.clip(neighbours + steps, 0.05, 0.95)
+        other_places = random.uniform(0.1, 0.9, (POSES // 2, joints))
+        next_places = np.concatenate([near_places, other_places])
+    return places
+
+
+def _excess_at_rest(problem: ExcitationProblem, places: Poses):
+    """Return the largest excess over constraints in each pose, at standstill."""
+    limits = problem.limits.limits
+    middle = 0.5 * (limits.position_min + limits.position_max)
+    half_range = 0.5 * (limits.position_max - limits.position_min)
+    # The places about which `Grid.fill` lets a motion of no size stand.
+    reach = FILLED_FRACTION * problem.limits.grid().bound
+    q = middle + reach * (2.0 * places - 1.0) * half_range
+    standstill = Motion(q, np.zeros_like(q), np.zeros_like(q))
+    excess = np.full(len(q), -np.inf)
+    for constraint in problem.constraints:
+        values = np.asarray(constraint(problem.robot, standstill))
+        excess = np.maximum(excess, values.max(axis=1))
+    return excess
+
+
+def _enlarge(problem: ExcitationProblem, draws: Draws) -> ScaledMotions:
+    """Return the motions of draws, as large as the constraints allow.
+
+    First each joint gets the size to which it may move while the others almost stand
+    still: a joint that has no room must not stop the others. Then all of them become
+    smaller together.
+    """
+    smallest_sizes = np.full(draws.places.shape, MIN_SIZE)
+    sizes = smallest_sizes.copy()
+    joints, _ = problem.limits.shape
+    for joint in range(joints):
+        target_sizes = smallest_sizes.copy()
+        target_sizes[:, joint] = 1.0
+        reached_sizes = _largest_sizes(
+            problem, draws, smallest_sizes, target_sizes, INSTANTS_OF_JOINTS
+        )
+        sizes[:, joint] = reached_sizes[:, joint]
+    sizes = _largest_sizes(problem, draws, smallest_sizes, sizes, WATCHED_INSTANTS)
+    return draws.motions(sizes)
+
+
+def _largest_sizes(
+    problem: ExcitationProblem,
+    draws: Draws,
+    low_sizes: Sizes,
+    high_sizes: Sizes,
+    instants: np.ndarray,
+) -> Sizes:
+    """Return the largest sizes between two that keep the constraints, by bisection."""
+    low = np.zeros((len(low_sizes), 1))
+    high = np.ones((len(low_sizes), 1))
+    growth = high_sizes / low_sizes
+    for _ in range(HALVINGS):
+        middle = 0.5 * (low + high)
+        motions = draws.motions(low_sizes * growth**middle)
+        excess = watched_excess(problem, motions, instants) + MARGIN
+        is_kept = excess[:, None] <= 0.0
+        low = np.where(is_kept, middle, low)
+        high = np.where(is_kept, high, middle)
+    return low_sizes * growth**low
