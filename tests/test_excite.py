@@ -204,7 +204,7 @@ def test_writes_the_motion_and_says_what_to_expect(written, run):
         "for one run of 7.854 s (100 samples at 12.73 Hz)",
         "standard deviation of 0.120 N m",
         "give `noise` if it is known",
-        "forces by the nominal parameters: 1 quantities keep their limits",
+        "forces by the nominal parameters: 1 of 1 limits are kept",
         "not checked: floor, self-collision",
     ):
         assert said in " ".join(out.split())
@@ -277,13 +277,13 @@ def test_floor_self_collision_and_forces_are_kept_by_default(tmp_path, run):
     assert code == 0, err
     said = " ".join(out.split())
     for words in (
-        "floor: 3 quantities",
-        "self-collision: 1 quant",
+        "floor: 3 of 3 limits",
+        "self-collision: 1 of 1 limits",
         "forces by the nominal",
     ):
         assert f"✓ {words}" in said
     assert "less a margin of 30 %" in said
-    assert said.startswith("✓ A motion that can be recorded: it keeps all limits")
+    assert said.startswith("✓ Record this motion: it keeps all limits")
     experiment = load_experiment(tmp_path / "arm.toml")
     q = table(tmp_path / "motion.csv")[:, 1:4]
     # The ends of all links in the plane in which they turn, from sums of angles.
@@ -366,7 +366,7 @@ def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):
     code, out, err = run("excite", tmp_path / "arm.toml", "-o", tmp_path / "motion.csv")
     assert code == 3, err
     said = " ".join(out.split())
-    assert "can be recorded" not in said
+    assert "Record this motion" not in said
     assert "✗ Do not record this motion yet" in said
     before = " ".join(err.split())
     for text in (before, said):
@@ -499,7 +499,9 @@ def test_tables_are_sampled_as_a_controller_wants_them(
         "motion.ros.yaml",
     ]
     said = [remark.text for remark in found.remarks]
-    assert "the motion runs through 2 periods; the deviations are for one." in said
+    assert (
+        "the motion runs through 2 periods; the deviations are for one period." in said
+    )
 
 
 def test_the_guide_shows_every_key():
@@ -539,8 +541,8 @@ def test_a_motion_without_a_way_into_it_is_written_with_a_warning(
     assert led.playable.motion is led.plan.trajectory
     text = " ".join(remark.text for remark in led.remarks)
     assert (
-        "the motion is without leads, and starts and ends at full speed: no lead is"
-        in text
+        "the motion has no lead in or out, so it starts and ends at full speed: "
+        "no lead is" in text
     )
 
 
@@ -577,7 +579,7 @@ def test_a_search_that_was_not_begun_cannot_go_on(run):
             "`controller` moves robots of 7 revolute joints, but `pendulum`",
         ),
         ("rest = true", "`harmonics` must be at least"),
-        ("rest = true\nspline = {}", "a `spline` rests at its ends"),
+        ("rest = true\nspline = {}", "a `spline` starts and ends at rest anyway"),
         (
             "spline = { point = 9 }",
             "`excitation.spline.point` is not a known key: did you mean `po",

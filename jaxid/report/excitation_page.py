@@ -141,8 +141,5 @@ def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
         )
     else:
         status = Status.GOOD
-        text = (
-            "A motion that can be recorded: it keeps all limits, and determines all "
-            "parameters."
-        )
+        text = "Record this motion: it keeps all limits and determines all parameters."
     return Remark(text, status)

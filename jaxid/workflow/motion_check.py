@@ -53,7 +53,7 @@ def check_joints(plan: ExcitationPlan) -> Remark:
     """Return whether the joints keep their limits."""
     derivatives = 4 if np.isfinite(np.asarray(plan.limits.limits.jerk)).any() else 3
     excess = np.asarray(plan.use)[:derivatives].max() - 1.0
-    quantities = "positions, speeds and accelerations"
+    quantities = "positions, speeds, accelerations"
     if excess > MAX_ROUNDING:
         text = f"{quantities}: limits are exceeded by {100 * excess:.2g} %"
         return Remark(text, Status.BAD)
@@ -99,8 +99,9 @@ def check_self_collision(
 def judge(name: str, findings: Sequence[Finding]) -> Remark:
     """Return a remark on the quantity nearest to its limit, or furthest beyond it."""
     worst_finding = max(findings, key=lambda finding: finding.value)
-    keeps_limits = worst_finding.value <= 0
-    verb = "keep their limits" if keeps_limits else "do not keep their limits"
-    nearest_finding = str(worst_finding).removeprefix("the ")
-    text = f"{name}: {len(findings)} quantities {verb}; the closest: {nearest_finding}"
-    return Remark(text, Status.GOOD if keeps_limits else Status.BAD)
+    kept_limits = sum(finding.value <= 0 for finding in findings)
+    text = (
+        f"{name}: {kept_limits} of {len(findings)} limits are kept; the closest: "
+        f"{str(worst_finding).removeprefix('the ')}"
+    )
+    return Remark(text, Status.GOOD if worst_finding.value <= 0 else Status.BAD)

@@ -109,10 +109,10 @@ class DesignedMotion(Summarised):
         return sort_remarks((*plan_remarks(self.plan), *self.remarks))
 
     def overview(self) -> list[Table]:
-        """Return the verdict, the findings, and the use of the limits, in few lines."""
+        """Return the verdict, the findings, and the use of the joints' limits."""
         checks = [x for x in self.findings if x.status is not Status.NEUTRAL]
-        _, _, *uses = self.plan.tables()
-        return [Table("", remarks=[self.verdict, *checks]), *uses]
+        _, _, limits, *_ = self.plan.tables()
+        return [Table("", remarks=[self.verdict, *checks]), limits]
 
     def tables(self) -> list[Table]:
         """Return the tables of the plan, then all findings and the verdict."""
@@ -256,8 +256,8 @@ def make_playable(
             begin, end = (float(time) for time in played_motion.window)
         except InputError as error:
             fault = (
-                "the motion is without leads, and starts and ends at full speed: "
-                f"{error} `rest = true` designs one at rest there."
+                "the motion has no lead in or out, so it starts and ends at full "
+                f"speed: {error} `rest = true` designs one at rest there."
             )
     elif leads is not None:
         end = begin + leads.periods * (end - begin)
@@ -351,7 +351,7 @@ def describe_motion(
     if leads is not None and leads.periods > 1:
         yield Remark(
             f"the motion runs through {leads.periods} periods; the deviations are for "
-            "one"
+            "one period"
         )
     yield from check_motion(task.surroundings, plan, task.force_fault)
     if task.nominal is not None:
