@@ -417,7 +417,9 @@ def test_what_has_changed_between_two_runs_is_told(folder, first, run):
     assert run("compare", "warm", "first")[0] == 0, "an earlier comparison may go"
     shutil.copytree("first", "again")
     code, out, _ = run("compare", "first", "again")
-    assert "were made of one log, `a.csv`, or of parts of it" in " ".join(out.split())
+    assert "were made from one log, `a.csv`, or from parts of it" in " ".join(
+        out.split()
+    )
     assert refused(run("compare", "first", "first/"), "`first` is given twice")
     assert refused(run("compare", "first", "none"), "`none` does not exist")
 

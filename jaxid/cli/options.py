@@ -162,8 +162,8 @@ def file_beside(experiment: Path, output: Path | None, name: str, force: bool) -
         )
     if output.parent.resolve() != experiment.parent.resolve():
         raise InputError(
-            "`--output` must be in the folder of the experiment file, from which its "
-            "paths are given."
+            "`--output` must be in the folder of the experiment file, since its paths "
+            "are relative to that folder."
         )
     return output
 

@@ -350,6 +350,6 @@ def _doubts(
         )
     if regrouped_columns.max_residual > MAX_UNEXPLAINED:
         yield (
-            "the combination of columns that replaces a dependent one has an error of "
-            f"{regrouped_columns.max_residual:.1e} of its size."
+            "the combination of columns that replaces a dependent one has a relative "
+            f"error of {regrouped_columns.max_residual:.1e}."
         )

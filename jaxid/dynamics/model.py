@@ -130,7 +130,7 @@ class Model(Hashable):
         parts = jax.tree.leaves(self.terms, is_leaf=_has_memory)
         laws = {part for part in parts if _has_memory(part)}
         if len(laws) > 1:
-            raise InputError("all terms with `Presliding` must have the same one.")
+            raise InputError("all terms with `Presliding` must share one `Presliding`.")
         return next(iter(laws), None)
 
     @property

@@ -75,7 +75,7 @@ def choose_model(
     Where the file leaves the cut-off open, it is chosen first, as for `identify_logs`:
     all models are compared in this one band.
 
-    Parts of time are left out in turn, or whole logs if there are at least four. A
+    Parts of the logs are left out in turn, or whole logs if there are at least four. A
     change is kept if it lowers the errors of the parts, relative to what they were, by
     more than two standard deviations of their mean, and the error in all by 1 %. The
     models are fitted by weighted least squares; the promised error is that of the

@@ -88,9 +88,9 @@ def data_doubts(
         # Different models are compared on one log on purpose.
         if comparison is not None:
             doubts.append(
-                f"Both reports were made of one log, `{path.name}`, or of parts of it: "
-                "differences between their parameters do not show that the robot has "
-                "changed"
+                f"Both reports were made from one log, `{path.name}`, or from parts of "
+                "it: differences between their parameters do not show that the robot "
+                "has changed"
             )
     for fit, paths in zip(fits, places, strict=True):
         if log is not None and log.resolve() in paths:

@@ -114,9 +114,9 @@ def with_unknown_delay(
     if ratios.max() > LIMITS.widening:
         parameter = fit.base.names[int(np.argmax(ratios))]
         note = (
-            f"intervals include a delay of the forces of {delay}: they are up to "
-            f"{significant(ratios.max(), 2)} times as wide as without it, with the "
-            f"largest change for `{parameter}`; faster motion determines the delay "
+            f"intervals include a possible delay of the forces, of {delay}: they are "
+            f"up to {significant(ratios.max(), 2)} times as wide as without it, with "
+            f"the largest change for `{parameter}`; faster motion determines the delay "
             "better."
         )
         notes = (*notes, note)

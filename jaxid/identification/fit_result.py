@@ -293,8 +293,8 @@ class Fit(Summarised, eqx.Module):
             ),
             (
                 "estimates",
-                f"{self.trust.count(Status.GOOD)} of {self.base.size} leave at most "
-                f"{100 * OPEN_SHARES.doubtful:g} % of the forces open",
+                f"{self.trust.count(Status.GOOD)} of {self.base.size} make at most "
+                f"{100 * OPEN_SHARES.doubtful:g} % of the forces uncertain",
             ),
         ]
 
@@ -322,19 +322,21 @@ class Fit(Summarised, eqx.Module):
         for direction in self.undetermined[:MAX_NAMED]:
             detail = "not moved at all"
             if np.isfinite(direction.uncertainty):
-                detail = f"leaves {percent(direction.uncertainty)} % of the forces open"
+                detail = (
+                    f"makes {percent(direction.uncertainty)} % of the forces uncertain"
+                )
             detail += f"; singular value {direction.singular_value:.1e} of the largest"
             sentence = f"{direction.sentence(self.base)}."
             remarks.append(Remark(sentence, status_of(direction.uncertainty), detail))
         if count > MAX_NAMED:
             remarks.append(Remark(f"And {count - MAX_NAMED} more"))
         advice = (
-            "A combination counts as not determined if its 95 % interval leaves more "
-            f"than {100 * OPEN_SHARES.doubtful:g} % of the forces of random motions "
-            "within the robot's limits open. The estimates of these parameters "
-            "must not be used individually, and the model may fail on other motions. "
-            "Record a motion that moves these joints in more poses, faster and in both "
-            "directions, or leave effects out in `[model]`"
+            "A combination counts as not determined if its 95 % interval makes more "
+            f"than {100 * OPEN_SHARES.doubtful:g} % of the forces uncertain, for "
+            "random motions within the robot's limits. The estimates of these "
+            "parameters must not be used individually, and the model may fail on "
+            "other motions. Record a motion that moves these joints in more poses, "
+            "faster and in both directions, or leave effects out in `[model]`"
         )
         if isinstance(self.solution, Complete):
             advice += (

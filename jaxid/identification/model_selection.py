@@ -20,11 +20,11 @@ from .problem import RegressionProblem, block_edges
 DIVISIONS = 10
 """Blocks of time of each log, of which the parts are made."""
 PARTS = 10
-"""Parts of time that are left out in turn when models are compared."""
+"""Parts of the logs that are left out in turn when models are compared."""
 LARGE_PARTS = 5
 """Parts for the promise: later motions differ more than neighbouring parts do."""
 MIN_LOGS = 4
-"""Number of logs from which whole logs are left out, instead of parts of time."""
+"""Number of logs from which whole logs are left out, instead of parts of logs."""
 MIN_BLOCKS = 3
 """Blocks of rows without which nothing remains for a fit once a part is left out."""
 SAMPLES_PER_CHUNK = 65536
@@ -131,7 +131,7 @@ class TimeParts(NamedTuple):
 
 
 def divide_logs(logs: Sequence[Observations], count: int = PARTS) -> TimeParts:
-    """Return parts of time, or whole logs where there are enough."""
+    """Return parts of the logs, or whole logs where there are enough."""
     block_sizes = [np.diff(block_edges(log, DIVISIONS)) for log in logs]
     log_numbers = np.repeat(np.arange(len(logs)), [*map(len, block_sizes)])
     if len(log_numbers) < MIN_BLOCKS:
@@ -143,7 +143,7 @@ def divide_logs(logs: Sequence[Observations], count: int = PARTS) -> TimeParts:
     if len(logs) < MIN_LOGS:
         count = min(count, len(log_numbers))
         blocks = np.arange(len(log_numbers)) * count // len(log_numbers)
-        words = f"{count} parts of time"
+        words = f"{count} parts of the logs"
     rows = [
         np.repeat(blocks[log_numbers == number], sizes)
         for number, sizes in enumerate(block_sizes)

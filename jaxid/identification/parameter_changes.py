@@ -185,8 +185,9 @@ class Comparison(Summarised, eqx.Module):
             "none had, the probability of calling any of them changed would be "
             f"{100 * chance:.3g} % at most (Holm)",
             f"{verdicts.count(Verdict.PERHAPS)} more have perhaps changed: zero lies "
-            f"outside the {100 * LEVEL:g} % interval of their difference. Of {tests} "
-            f"parameters that do not change, about {chance * tests:.2g} look so",
+            f"outside the {100 * LEVEL:g} % interval of their difference. This happens "
+            f"by chance to about {chance * tests:.2g} of {tests} parameters that do "
+            "not change",
         ]
 
     def group_summary(self) -> Table:

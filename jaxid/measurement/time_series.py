@@ -186,8 +186,9 @@ def _rate(times: Vector) -> float:
 def _rate_note(channel: str, joints: list[str], rate: float, main_rate: float) -> str:
     """Return a remark about a channel with other times, and what its rate costs."""
     note = (
-        f"`{channel}` of joints {', '.join(joints)} have their own times ({rate:g} "
-        f"Hz): interpolated linearly at those of the angles ({main_rate:g} Hz)"
+        f"`{channel}` of joints {', '.join(joints)} have their own time stamps "
+        f"({rate:g} Hz): they were interpolated linearly at the stamps of the angles "
+        f"({main_rate:g} Hz)"
     )
     if rate < SLOW_RATE * main_rate:
         note += (

@@ -185,9 +185,9 @@ def _estimates(report: Report) -> list[Any]:
     )
     note = (
         "* combined with other parameters that forces cannot separate from it: see "
-        "its combination. Open: the uncertainty of the torques of random motions that "
-        "follows from its interval, in percent. A small parameter matters little, "
-        "however wide its interval."
+        "its combination. Open: how uncertain the interval makes the torques of "
+        "random motions, in percent. A small parameter matters little, however wide "
+        "its interval."
     )
     doubts = [fit.determination] if fit.undetermined else []
     all_parameters = folded(

@@ -47,7 +47,7 @@ NOT_VALIDATED = Remark(
     Status.DOUBTFUL,
 )
 """Doubt about a simulation that was compared with the logs of its fit only."""
-HOW_TO_READ = "Of parameters with several names the logs determine the sum only."
+HOW_TO_READ = "If a row names several parameters, the logs determine only their sum."
 """How to read the table of estimates."""
 Sources = Mapping[str, Sequence[Path]]
 """Logs of the `fit`, and those for its `validation`, which it has not seen."""
@@ -97,9 +97,9 @@ def servo_report(
     disagreements = sum(not c.agrees for c in fit.combinations)
     if disagreements:
         text = (
-            f"Motions or equal joints differ in {disagreements} of "
-            f"{len(fit.combinations)} parameters by more than noise: their intervals "
-            "are wider, and they are marked !"
+            f"In {disagreements} of {len(fit.combinations)} parameters, motions or "
+            "equal joints differ by more than noise: these parameters have wider "
+            "intervals, and are marked !"
         )
         findings.append(Remark(text))
     rows = []

@@ -222,9 +222,7 @@ def _count(joints: int | None, *values: Numbers | None):
     for value in values:
         if value is not None and np.shape(value):
             return np.shape(value)[0]
-    raise InputError(
-        "`joints` must be given where no list with one number for each joint is."
-    )
+    raise InputError("give `joints`, or a list with one number for each joint.")
 
 
 def per_joint(name: str, value: Numbers | None, joints: int, unknown: float) -> Any:
@@ -287,7 +285,7 @@ def range_fault(low: float, high: float, revolute: bool) -> str:
     if revolute and seems_in_degrees(end):
         return f"ranges to {end:g} rad, which is {abs(end) / (2 * np.pi):.3g} turns"
     if not revolute and abs(end) > MAX_LENGTH:
-        return f"ranges to {end:g} m, which no robot does"
+        return f"ranges to {end:g} m, further than any robot"
     return ""
 
 
@@ -325,9 +323,9 @@ def limit_notes(
             joints_by_speed.setdefault(float(speed), []).append(name)
     for speed, joints in joints_by_speed.items():
         notes.append(
-            f"{owners('joint', joints)}: a velocity of up to "
-            f"{speed:g} rad/s is {30 * speed / np.pi:.4g} turns a minute: "
-            "is the limit in degrees per second, or none?"
+            f"{owners('joint', joints)}: a velocity of up to {speed:g} rad/s is "
+            f"{30 * speed / np.pi:.4g} turns a minute: is the limit in degrees per "
+            "second, or is there none?"
         )
     return notes
 

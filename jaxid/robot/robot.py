@@ -205,8 +205,8 @@ class Robot(Summarised, eqx.Module):
         for field, entries in numbers.items():
             if entries.shape[-1:] != (n,):
                 raise InputError(
-                    f"`{field}` must be of {n} joints, "
-                    f"like the robot, but are of {entries.shape[-1]}."
+                    f"`{field}` must describe {n} joints, as the robot has, but "
+                    f"describe {entries.shape[-1]}."
                 )
 
     def _check_bodies(self):
@@ -221,8 +221,8 @@ class Robot(Summarised, eqx.Module):
         # A circle of parents is left out of the order.
         if len(self.parent) != n or not are_earlier or len(self.order) != n:
             raise InputError(
-                "`parent` must hold an earlier body, or -1, "
-                f"for each of {n}, but is {self.parent}."
+                f"`parent` must hold an earlier body, or -1, for each of {n} bodies, "
+                f"but is {self.parent}."
             )
         bodies = {"tip_body": self.tip_body}
         if self.tool is not None:

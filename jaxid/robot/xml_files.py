@@ -46,7 +46,8 @@ def _refuse_huge(path: str | Path, root: Any):
         if size > MAX_PARTS[element.tag]:
             raise InputError(
                 f"`{path}`, line {element.sourceline}: `<{element.tag}>` makes {size} "
-                f"parts, but may make {MAX_PARTS[element.tag]}: lower its numbers."
+                f"parts, but at most {MAX_PARTS[element.tag]} are allowed: lower its "
+                "numbers."
             )
 
 

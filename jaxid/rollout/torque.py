@@ -397,11 +397,11 @@ def _require_stable_simulation(
     if is_wrong.any():
         names = np.array(rollout.base.model.robot.joint_names)[is_wrong]
         raise InputError(
-            f"`observations`: under the recorded torques a simulation of "
-            f"{', '.join(names)} misses more within {horizon:g} s than a joint at "
-            "rest would: these logs determine torques (`jaxid identify`), but no "
-            "simulation. Robots whose logs hold commanded positions need "
-            "`recording.commands`."
+            "`observations`: with the recorded torques, a simulation of "
+            f"{', '.join(names)} has larger errors after {horizon:g} s than a joint at "
+            "rest would have: use these logs for a model of torques (`jaxid "
+            "identify`), not for a simulation. Robots whose logs hold commanded "
+            "positions need `recording.commands`."
         )
 
 

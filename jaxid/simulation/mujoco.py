@@ -42,8 +42,8 @@ class MujocoRobot(VirtualRobot):
         mujoco = import_mujoco()
         if self.robot.followers:
             raise InputError(
-                f"joint `{self.robot.followers[0].name}` follows another one, which "
-                "MuJoCo holds to it by a soft constraint only: simulate with "
+                f"joint `{self.robot.followers[0].name}` follows another joint, but "
+                "MuJoCo couples them only by a soft constraint: simulate with "
                 "`jid.VirtualRobot`."
             )
         friction = self.present_friction

@@ -245,9 +245,9 @@ def _judge_growth(report: Report) -> Iterator[Remark]:
     ratio = error / max(unexplained_error(report.verification), 1e-9)
     if error > GROWTH.error and ratio > GROWTH.ratio:
         yield Remark(
-            f"On new motion the errors are {significant(ratio, 2)} times those of the "
-            "same model fitted to it: the motion of the fit is too poor, or something "
-            "has changed between the logs",
+            f"On new motion the errors are {significant(ratio, 2)} times as large as "
+            "those of the same model fitted to that motion: the motion of the fit is "
+            "too poor, or something has changed between the logs",
             Status.DOUBTFUL,
         )
 

@@ -37,5 +37,5 @@ def rest_remarks(described_log: DescribedLog) -> tuple[str, ...]:
         f"the motion does not determine friction at rest: on unseen parts of {names} "
         f"the errors are up to {significant(100 * errors[worst_joint], 2)} % of the "
         f"forces, and {significant(100 * moving_errors[worst_joint], 2)} % without "
-        f"rows at rest: leave these out by `min_speed = [{texts}]` in `[rows]`.",
+        f"rows at rest: leave these rows out by `min_speed = [{texts}]` in `[rows]`.",
     )

@@ -31,8 +31,8 @@ UNIT_FACTORS = {
 UNIT_START = "the angles of the log seem to be in "
 """Begin of all sentences about units of angles."""
 NO_UNIT_TEXT = (
-    UNIT_START + "no unit with a name, roughly {} (`recording.angle_unit` takes "
-    "numbers, beside `angle_offsets`; or `drives.gear_ratios`)"
+    UNIT_START + "an unnamed unit, roughly {} (give a number as "
+    "`recording.angle_unit`, with `angle_offsets`, or correct `drives.gear_ratios`)"
 )
 UNIT_TEXTS = {
     1.0: UNIT_START + "{} (`recording.angle_unit`)",

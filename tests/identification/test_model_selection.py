@@ -40,7 +40,7 @@ def trial(size, *squares):
 def test_errors_are_those_of_least_squares_without_the_part(count):
     observed = logs(count)
     parts = divide_logs(observed)
-    assert parts.words == ("10 parts of time" if count == 1 else "4 logs")
+    assert parts.words == ("10 parts of the logs" if count == 1 else "4 logs")
     training = column_products(BASE, observed, parts, WEIGHTS)
     judged = column_products(BASE, observed, parts, np.ones(2))
     products = UnseenParts(
@@ -144,7 +144,7 @@ def test_a_choice_that_promises_more_error_than_the_file_is_no_tick(promise, sta
         predictions=prediction(promise),
         first_predictions=prediction(0.2),
         band="below 10 Hz",
-        parts="10 parts of time",
+        parts="10 parts of the logs",
         is_complete=True,
     )
     assert choice.remarks[0].status is status

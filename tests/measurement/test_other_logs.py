@@ -233,7 +233,9 @@ def test_topics_with_other_times_are_interpolated(tmp_path):
     others += states(ROS2, topic="/e", lag=900_000, start=25, stop=38)
     path = write_mcap(tmp_path / "a.mcap", states(ROS2) + others)
     r = read_recording(path, Columns("/js.position[{}]", "/e.effort[{}]"))
-    assert r.notes[0].startswith("`forces` of joints 1, 2, 3 have their own times")
+    assert r.notes[0].startswith(
+        "`forces` of joints 1, 2, 3 have their own time stamps"
+    )
     assert r.notes[1].startswith("16 of 40 rows of the angles were left out")
     assert r.segments == ((0, 12), (12, 24))
     angles, _, efforts = numbers()

@@ -62,7 +62,9 @@ def test_torques_that_determine_no_simulation_are_refused(base):
     forces = np.asarray(log.forces)[:, ::-1]
     wrong = jid.Recording.of(log.angles, forces, sample_time=log.sample_time)
     seen = jid.observe(wrong, base.model.robot, jid.ZeroPhaseButterworth(30.0))
-    with pytest.raises(jid.InputError, match=r"misses more within 0\.1 s than a joint"):
+    with pytest.raises(
+        jid.InputError, match=r"larger errors after 0\.1 s than a joint"
+    ):
         jid.rollout.identify_torque_rollout(base, seen, horizon=0.1)
 
 

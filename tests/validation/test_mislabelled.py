@@ -133,7 +133,7 @@ def test_no_unit_is_proposed_whose_factor_the_log_does_not_show(motors, said, na
     texts = said(angles / scale, forces, angle_unit=angle_unit)
     assert not any("to be in deg" in text or "to be in re" in text for text in texts)
     if angle_unit == "rad":
-        assert "no unit with a name, roughly deg" in texts[0]
+        assert "an unnamed unit, roughly deg" in texts[0]
 
 
 @pytest.mark.parametrize(("joint", "channel"), [(3, "force"), (3, "angle")])

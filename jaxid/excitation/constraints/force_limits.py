@@ -72,9 +72,9 @@ class ForceLimits(AbstractConstraint):
         parameters = np.asarray(self.parameters)
         if parameters.shape != (size,) or not np.isfinite(parameters).all():
             raise InputError(
-                "`parameters` must hold one finite number for each base "
-                f"parameter ({size}), but has shape {parameters.shape}: "
-                "`base.from_standard` makes them of standard ones."
+                "`parameters` must hold one finite number for each base parameter "
+                f"({size}), but has shape {parameters.shape}: `base.from_standard` "
+                "computes them from standard parameters."
             )
         covariance = self.covariance
         if covariance is None:

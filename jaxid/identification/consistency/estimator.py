@@ -98,10 +98,9 @@ class Consistency(eqx.Module):
         ]
         if not self.certified:
             sentences.append(
-                "the squared residuals may exceed the smallest possible ones by "
-                f"{self.error_bound:.1e} of them; only up to "
-                f"{2 * solver.TOLERANCE:.0e} counts as proof of the optimum: widen the "
-                "bounds."
+                "the optimum is not proven: the squared residuals may exceed the "
+                f"smallest possible ones by a fraction of {self.error_bound:.1e}, but "
+                f"{2 * solver.TOLERANCE:.0e} is allowed: widen the bounds."
             )
         return tuple(sentences)
 

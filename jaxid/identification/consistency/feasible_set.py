@@ -199,7 +199,7 @@ def _couplings(model: Model) -> Iterator[Coupling]:
             axes = np.flatnonzero(labels == label)
             if len(axes) > MAX_COUPLED_AXES:
                 raise InputError(
-                    f"drives may couple 4 axes, but `{robot.name}` has more."
+                    f"drives may couple at most 4 axes, but `{robot.name}` has more."
                 )
             if len(axes) > 1:
                 yield _coupling(kind, matrix[np.ix_(axes, axes)])

@@ -136,9 +136,9 @@ class IterativelyReweighted(AbstractEstimator):
         notes = ()
         if change > self.tolerance:
             notes = (
-                f"the robust estimate still changed by {100 * change:.2g} % "
-                f"of the residuals after {self.iterations} iterations: "
-                "there are too many outliers to tell them apart.",
+                f"the robust estimate still changed by {100 * change:.2g} % of the "
+                f"residuals after {self.iterations} iterations: there are too many "
+                "outliers to separate them from good rows.",
             )
         return dataclasses.replace(
             Estimate.solve(problem, weights * np.sqrt(slopes), solution),

@@ -155,8 +155,8 @@ def bootstrap(
     is_open = ~(np.asarray(condition) < 1 / np.sqrt(RIDGE))
     if is_open.any():
         raise InputError(
-            f"{is_open.sum()} of {draws} draws leave "
-            "parameters open: take longer `blocks`."
+            f"{is_open.sum()} of {draws} draws do not determine all parameters: take "
+            "longer `blocks`."
         )
     total_gradients = occurrences @ np.array(gradients)
     steps = np.einsum("dij,dj->di", np.asarray(inverse), total_gradients)

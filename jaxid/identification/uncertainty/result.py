@@ -79,8 +79,8 @@ class Uncertainty(eqx.Module):
         if not np.isfinite(deviations).all():
             number = int(np.argmax(~np.isfinite(deviations))) + 1
             raise InputError(
-                "draws need parameters that the logs determine, "
-                f"but number {number} is not."
+                "draws need parameters that the logs determine, but parameter "
+                f"{number} is not determined."
             )
         correlation = self.covariance / np.outer(deviations, deviations)
         variances, axes = np.linalg.eigh(correlation)
