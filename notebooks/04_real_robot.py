@@ -188,8 +188,8 @@ jid.plot.residuals(fit.residual_spectra, robot)
 # %% [markdown]
 # ## Would another estimator do better?
 #
-# On the TX40's log they differ by a few percent of their errors, much less than seen and unseen
-# data do: a better log, or a better friction law, is worth more than another estimator ([how to choose](../docs/how_to_choose.md)).
+# On the TX40's log their errors differ by a few percent, much less than errors on the motion of the fit differ from errors on other motion: a better log, or a
+# better friction law, is worth more than another estimator ([how to choose](../docs/how_to_choose.md)).
 
 # %%
 estimators = {

@@ -233,8 +233,8 @@ plt.show()
 #
 # ## On a GPU
 #
-# Where JAX finds a GPU (`pip install "jax[cuda12]"`), its arrays live there and the calls above run there. Called as above, a batch goes through in groups, so
-# that memory does not grow with its size; under `jax.jit` it is one computation for the device, without a step on the host in between:
+# Where JAX finds a GPU (`pip install "jax[cuda12]"`), its arrays live there and the calls above run there. Called as above, a batch is computed in groups, so that
+# memory does not grow with its size; under `jax.jit` it is one computation for the device, without a step on the host in between:
 
 # %%
 device = jax.devices()[0]  # a GPU, where there is one
@@ -250,7 +250,7 @@ print(
 # %% [markdown]
 # The amount of work decides: a single log of a few seconds leaves a GPU idle, thousands of data sets do not. All computations are in double precision,
 # which is slow on consumer graphics cards. This notebook was executed on a CPU; `benchmarks/gpu.py` says what your GPU does. Several devices and several hosts
-# share the work on long logs by factors: [many devices and processes](../docs/cluster.md).
+# can share the work on long logs: [many devices and processes](../docs/cluster.md).
 #
 # ## What you learned
 #

@@ -117,8 +117,8 @@ jid.plot.bars({f"{name} model": one for name, one in errors.items()}, robot)
 # ## A law instead of two states
 #
 # Friction at several temperatures gives its law: $f_v(T) = f_v(T_0)\, e^{-a (T - T_0)}$, with an interval for each rate: the logarithms of the estimates lie on a
-# line, each as uncertain as its estimate is relative to its size. Two more logs in between are enough: the picture shows the first four axes, their points a
-# little apart sideways. `law` is a friction term for models at any temperature.
+# line, and the deviation of each logarithm is the relative deviation of its estimate. Two more logs in between are enough: the picture shows the first four axes,
+# their points a little apart sideways. `law` is a friction term for models at any temperature.
 
 # %%
 steps = (20.0, 28.0, 36.0, 45.0)
@@ -172,7 +172,7 @@ for j, name in enumerate(robot.joint_names):
 # ## What you learned
 #
 # * Identify the robot in the state in which it works: the errors of the cold model on the warm robot are many times larger than those of the warm model.
-# * Bodies must *not* change between both states. If they do, something else is wrong, and `jid.compare` reports it with few false alarms.
+# * Bodies must *not* change between the two states. If they do, something else is wrong, and `jid.compare` reports it with few false alarms.
 # * A few logs at known temperatures give a law with intervals, and models that follow the temperature. Details: [several runs](../docs/uncertainty.md).
 #
 # Next: [your own robot](08_your_robot.ipynb).

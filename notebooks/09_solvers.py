@@ -213,7 +213,7 @@ axes.grid(axis="y", visible=False)
 plt.show()
 
 # %% [markdown]
-# The plan keeps the criterion after each step: most is gained in the first stages, and the generations find what one start alone does not.
+# The plan keeps the criterion after each step: most is gained in the first stages, and the generations find motions that no single start finds.
 
 # %%
 figure, panels = plt.subplots(1, 2, figsize=(11, 3.2))
@@ -249,7 +249,7 @@ print("shape of the Hessian:", jax.jit(jax.hessian(problem.value))(x).shape)
 #
 # * An `ExcitationProblem` is four functions of one vector; any solver fits around them.
 # * `jid.excitation.minimise(problem, solver)` turns what a solver finds into a motion that keeps its limits for all times, with tables and files like any other design.
-# * From four starts, SLSQP and BFGS come within some percent of ours; the generations make the rest.
+# * From four starts, SLSQP and BFGS come within some percent of ours; the remaining difference is due to the generations.
 #
 # The guide: [excitation](../docs/excitation.md). Next: [no torque in the log](10_no_torque.ipynb).
 #

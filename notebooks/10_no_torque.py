@@ -67,12 +67,12 @@ panels[0].legend()
 plt.show()
 
 # %% [markdown]
-# Commands stand in the place of forces: a recording is what acts and what follows.
+# Commands take the place of forces: a recording holds the input of a robot and the motion that follows from it.
 #
 # ## Identify
 #
-# The mass of the body is known, from a URDF file or a scale. Gravity makes the joint sag, and the sag determines the stiffness; all other parameters are ratios to it. The
-# simulation decides by motions left out which effects it needs.
+# The mass of the body is known, from a URDF file or a scale. Gravity makes the joint sag, and the sag determines the stiffness; all other parameters are ratios to it. Which
+# effects the simulation needs is decided by its errors on motions that are left out of the fit.
 
 # %%
 robot = jid.Robot(
@@ -151,12 +151,13 @@ print(slow_fit)
 #
 # ## Exercise
 #
-# Suppose that the weight of the body is unknown: identify the three logs with `bodies=None`. Which row of the table goes, and which values stay the same?
+# Suppose that the weight of the body is unknown: identify the three logs with `bodies=None`. Which row of the table disappears, and which values stay the same?
 #
 # <details markdown="1"><summary>Answer</summary>
 #
 # `jid.identify_rollout(logs, joint_names=["lift"])` has no row of `1 / stiffness`, and the stiffness is not determined: no known gravity torque acts on the
-# joint any more, and a bias replaces it. Damping, dry friction and delay stay the same, since they are ratios to the stiffness, or times. The inertia is then that of
-# the rotor and the body together. Errors grow from 0.4 to 2 mrad, and a remark says that an effect is missing: a bias is the same at every angle, gravity is not.
+# joint any more, and a bias replaces it. The delay stays the same, and so do damping and dry friction, which are ratios to the stiffness. The inertia is then that of
+# the rotor and the body together. Errors grow from 0.4 to 2 mrad, since a bias
+# is the same at every angle and the gravity torque is not. A remark says that an effect is missing.
 #
 # </details>
