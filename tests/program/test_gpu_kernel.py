@@ -108,6 +108,20 @@ def test_results_that_are_inputs_or_constants():
     np.testing.assert_array_equal(found, expected)
 
 
+def test_inputs_are_loaded_where_they_are_read():
+    """All of them at the start would not fit into the registers of a thread."""
+    p, *arrays = numbers(PANDA, 300)
+    shapes = [p.shape, *[(7,)] * 3]
+    kernel = functools.partial(in_kernel, program_of(PANDA, PANDA.forces, *shapes))
+    (call,) = jax.make_jaxpr(kernel)(p, *arrays).eqns
+    (call,) = call.params["call"].eqns
+    names = [x.primitive.name for x in call.params["jaxpr"].eqns]
+    loads = np.flatnonzero(np.array(names) == "get")
+    assert len(loads) == 101
+    assert names.index("cos") < loads[1]
+    assert np.median(loads) > 0.3 * len(names)
+
+
 def test_no_samples(on_gpu):
     p, *arrays = numbers(ARM, 0)
     assert jax.jit(lambda *x: ARM.inverse_dynamics(*x))(p, *arrays).shape == (0, 2)
