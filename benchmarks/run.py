@@ -73,6 +73,7 @@ METHODS = (
     Script("transients", 1),
     Script("excitation", 60),
     Script("safe_motions", 40),
+    Script("first_motion", 15),
     Script("export", 10),
     Script("virtual_robot", 5),
     Script("demo", 10),

@@ -37,7 +37,7 @@ MIN_SIZE = 1e-3
 """Size of a motion that is almost at rest, relative to the limits of the joints."""
 HALVINGS = 7
 """Bisections of the logarithm of a size; then it is found to 6 %."""
-INSTANTS_OF_JOINTS = WATCHED_INSTANTS[::4]
+INSTANTS_OF_JOINTS = WATCHED_INSTANTS[::6]
 """Instants at which joints are tried alone, which needs not be exact."""
 
 
@@ -120,40 +120,48 @@ def _excess_at_rest(problem: ExcitationProblem, places: Poses):
 def _enlarge(problem: ExcitationProblem, draws: Draws) -> ScaledMotions:
     """Return the motions of draws, as large as the constraints allow.
 
-    First each joint gets the size to which it may move while the others almost stand
-    still: a joint that has no room must not stop the others. Then all of them become
-    smaller together.
+    The joints of every other motion become smaller alike, from full size. Those of the
+    others do so from the sizes that they reach alone.
     """
-    smallest_sizes = np.full(draws.places.shape, MIN_SIZE)
-    sizes = smallest_sizes.copy()
+    sizes = np.ones(draws.places.shape)
+    other_draws = Draws(draws.grid, draws.shapes[1::2], draws.places[1::2])
+    sizes[1::2] = _sizes_of_joints_alone(problem, other_draws)
+    return draws.motions(_largest_sizes(problem, draws, sizes, WATCHED_INSTANTS))
+
+
+def _sizes_of_joints_alone(problem: ExcitationProblem, draws: Draws) -> Sizes:
+    """Return how large each joint may move while the others almost stand still.
+
+    So a joint that has no room does not stop the others.
+    """
+    sizes = np.ones(draws.places.shape)
     joints, _ = problem.limits.shape
     for joint in range(joints):
-        target_sizes = smallest_sizes.copy()
+        target_sizes = np.full(draws.places.shape, MIN_SIZE)
         target_sizes[:, joint] = 1.0
-        reached_sizes = _largest_sizes(
-            problem, draws, smallest_sizes, target_sizes, INSTANTS_OF_JOINTS
-        )
+        reached_sizes = _largest_sizes(problem, draws, target_sizes, INSTANTS_OF_JOINTS)
         sizes[:, joint] = reached_sizes[:, joint]
-    sizes = _largest_sizes(problem, draws, smallest_sizes, sizes, WATCHED_INSTANTS)
-    return draws.motions(sizes)
+    return sizes
 
 
 def _largest_sizes(
     problem: ExcitationProblem,
     draws: Draws,
-    low_sizes: Sizes,
     high_sizes: Sizes,
     instants: np.ndarray,
 ) -> Sizes:
-    """Return the largest sizes between two that keep the constraints, by bisection."""
-    low = np.zeros((len(low_sizes), 1))
-    high = np.ones((len(low_sizes), 1))
-    growth = high_sizes / low_sizes
+    """Return the largest sizes that keep the constraints, by bisection.
+
+    They lie between almost standing still and the sizes that are given.
+    """
+    low = np.zeros((len(high_sizes), 1))
+    high = np.ones((len(high_sizes), 1))
+    growth = high_sizes / MIN_SIZE
     for _ in range(HALVINGS):
         middle = 0.5 * (low + high)
-        motions = draws.motions(low_sizes * growth**middle)
+        motions = draws.motions(MIN_SIZE * growth**middle)
         excess = watched_excess(problem, motions, instants) + MARGIN
         is_kept = excess[:, None] <= 0.0
         low = np.where(is_kept, middle, low)
         high = np.where(is_kept, high, middle)
-    return low_sizes * growth**low
+    return MIN_SIZE * growth**low
