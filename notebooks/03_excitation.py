@@ -219,7 +219,7 @@ for k, (name, plan) in enumerate(plans.items()):
 #
 # <details markdown="1"><summary>Answer</summary>
 #
-# Accelerations grow by 4, so deviations of moments of inertia become 4 times smaller. Speeds grow by 2: viscous friction 2 times. Dry friction and gravity do
-# not depend on the speed: their deviations stay. Four recordings halve *all* deviations.
+# Accelerations become 4 times as large, so deviations of moments of inertia become 4 times smaller. Speeds become twice as large, so those of viscous friction
+# become 2 times smaller. Dry friction and gravity do not depend on the speed: their deviations stay. Four recordings halve *all* deviations.
 #
 # </details>

@@ -15,7 +15,7 @@ from . import options, terminal
 if TYPE_CHECKING:
     from jaxid.report.several_runs_report import RunsReport
 
-TITLE_OF_LINES = "to subtract this payload from other logs, add to the experiment file:"
+TITLE_OF_LINES = "to use this result for other logs, add to the experiment file:"
 
 
 def payload(

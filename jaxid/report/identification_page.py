@@ -185,8 +185,8 @@ def _estimates(report: Report) -> list[Any]:
     )
     note = (
         "* combined with other parameters that forces cannot separate from it: see "
-        "its combination. Open: how uncertain the interval makes the torques of "
-        "random motions, in percent. A small parameter matters little, however wide "
+        "its combination. Open: percentage of the torques of random motions that the "
+        "interval leaves uncertain. A small parameter matters little, however wide "
         "its interval."
     )
     doubts = [fit.determination] if fit.undetermined else []

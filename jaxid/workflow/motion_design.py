@@ -257,7 +257,8 @@ def make_playable(
         except InputError as error:
             fault = (
                 "the motion has no lead in or out, so it starts and ends at full "
-                f"speed: {error} `rest = true` designs one at rest there."
+                f"speed: {error} `rest = true` designs a motion that starts and ends "
+                "at rest."
             )
     elif leads is not None:
         end = begin + leads.periods * (end - begin)
