@@ -9,6 +9,8 @@ the same factors, it is taken from them: the velocity of the origin itself is ne
 formed. Everything else is a derivative of this recursion.
 """
 
+from typing import Any
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -38,35 +40,52 @@ def body_motions(
     for i in robot.order:
         parent = robot.parent[i]
         a, w, wd = motions[parent] if parent >= 0 else ground
-        R, r = placement_in_parent(robot, i, q[i])
-        axis = robot.axis[i]
-        # The parent carries the body ...
-        w_cross = skew(w)
-        accelerations = skew(wd) + w_cross @ w_cross
-        a = R.T @ (a + accelerations @ r)
-        w_parent = R.T @ w
-        wd_parent = R.T @ wd
-        # ... and the joint moves it relative to the parent.
-        rate = axis * qdd[i]
-        turned_rate = jnp.cross(w_parent, axis) * qd[i]
-        w = w_parent
-        wd = wd_parent
-        if robot.turns[i]:
-            w = w + axis * qd[i]
-            wd = wd + rate + turned_rate
-        else:
-            a = a + rate + 2.0 * turned_rate
+        with jax.named_scope(f"motion_{i}"):
+            R, r = placement_in_parent(robot, i, q[i])
+            axis = robot.axis[i]
+            # The parent carries the body ...
+            w_cross = skew(w)
+            accelerations = skew(wd) + w_cross @ w_cross
+            a = R.T @ (a + accelerations @ r)
+            w_parent = R.T @ w
+            wd_parent = R.T @ wd
+            # ... and the joint moves it relative to the parent.
+            rate = axis * qdd[i]
+            turned_rate = jnp.cross(w_parent, axis) * qd[i]
+            w = w_parent
+            wd = wd_parent
+            if robot.turns[i]:
+                w = w + axis * qd[i]
+                wd = wd + rate + turned_rate
+            else:
+                a = a + rate + 2.0 * turned_rate
         motions[i] = (a, w, wd)
     return motions
 
 
-def partial_velocities(robot: Robot, q: Joints, qd: Joints, qdd: Joints):
-    r"""Return $\ddot q \to (a, \dot\omega)$, whose slope is $F_{o,i}$ (Eqs. 5, 7)."""
+def partial_velocities(robot: Robot, q: Joints) -> list[dict[int, AnyArray]]:
+    r"""Return $\partial (v_o, \omega)_i / \partial \dot q_j$, rows of $F_{o,i}^T$.
 
-    def accelerations(x):
-        return [jnp.concatenate([a, wd]) for a, _, wd in body_motions(robot, q, qd, x)]
-
-    return accelerations
+    Returns:
+        For each body the rows of the joints that move it (Eqs. 5, 7).
+    """
+    q = all_coordinates(robot.followers, q)
+    rows: list[dict[int, AnyArray]] = [{} for _ in range(robot.bodies)]
+    for i in robot.order:
+        with jax.named_scope(f"motion_{i}"):
+            R, r = placement_in_parent(robot, i, q[i])
+        parent = robot.parent[i]
+        carried_rows = rows[parent] if parent >= 0 else {}
+        for j, row in carried_rows.items():
+            with jax.named_scope(f"row_{i}_{j}"):
+                v = row[:3]
+                w = row[3:]
+                velocity = R.T @ (v + skew(w) @ r)
+                rows[i][j] = jnp.concatenate([velocity, R.T @ w])
+        axis = robot.axis[i]
+        directions = [np.zeros(3), axis] if robot.turns[i] else [axis, np.zeros(3)]
+        rows[i][i] = jnp.concatenate(directions)
+    return rows
 
 
 def momentum_matrix(w: Vector3) -> AnyArray:
@@ -107,31 +126,54 @@ def rigid_body_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> An
     Returns:
         For each joint (first axis) the columns of each body (second axis).
     """
-    # The accelerations are affine in qdd: their slope is the same at any point.
-    F = jax.jacfwd(partial_velocities(robot, q, qd, qdd))(qdd)
-    bodies = [body_regressor(*m) for m in body_motions(robot, q, qd, qdd)]
-    return jnp.stack([f.T @ b for f, b in zip(F, bodies, strict=True)], axis=1)
+    n = robot.bodies
+    motions = body_motions(robot, q, qd, qdd)
+    partials = partial_velocities(robot, q)
+    columns: list[list] = [[jnp.zeros(10)] * n for _ in range(n)]
+    for i in range(n):
+        with jax.named_scope(f"motion_{i}"):
+            body = body_regressor(*motions[i])
+        for j, row in partials[i].items():
+            with jax.named_scope(f"row_{i}_{j}"):
+                columns[j][i] = row @ body
+    rows = jnp.stack([jnp.stack(bodies) for bodies in columns])
+    return on_coordinates(robot.followers, rows)
 
 
 def rigid_body_forces(
     robot: Robot, p: Bodies, q: Joints, qd: Joints, qdd: Joints
 ) -> Joints:
     r"""Return the forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11)."""
-    motions = body_motions(robot, q, qd, qdd)
-    wrenches = [body_regressor(*m) @ p[i] for i, m in enumerate(motions)]
-    return joint_forces(robot, wrenches, q, qd, qdd)
+    wrenches = []
+    for i, motion in enumerate(body_motions(robot, q, qd, qdd)):
+        with jax.named_scope(f"motion_{i}"):
+            wrenches.append(body_regressor(*motion) @ p[i])
+    return joint_forces(robot, wrenches, q)
 
 
-def joint_forces(
-    robot: Robot, wrenches: list[AnyArray], q: Joints, qd: Joints, qdd: Joints
-) -> Joints:
-    """Project force and moment of each body on the joints [N m or N].
+def joint_forces(robot: Robot, wrenches: list[AnyArray], q: Joints) -> Joints:
+    r"""Project force and moment of each body on the joints: $\sum_i F_{o,i}^T w_i$.
 
-    The projection is the transpose of the map that gives the accelerations: it is
-    applied, and the Jacobian is never built.
+    A body passes its wrench on to its parent, and each joint feels what passes it.
     """
-    _, project = jax.vjp(partial_velocities(robot, q, qd, qdd), qdd)
-    return project(wrenches)[0]
+    q = all_coordinates(robot.followers, q)
+    wrenches = list(wrenches)
+    forces: list[Any] = [None] * robot.bodies
+    for i in reversed(robot.order):
+        with jax.named_scope(f"motion_{i}"):
+            R, r = placement_in_parent(robot, i, q[i])
+        with jax.named_scope(f"force_{i}"):
+            force = wrenches[i][:3]
+            moment = wrenches[i][3:]
+            forces[i] = robot.axis[i] @ (moment if robot.turns[i] else force)
+            parent = robot.parent[i]
+            if parent < 0:
+                continue
+            force = R @ force
+            moment = R @ moment + jnp.cross(r, force)
+            wrench = jnp.concatenate([force, moment])
+            wrenches[parent] = wrenches[parent] + wrench
+    return on_coordinates(robot.followers, jnp.stack(forces))
 
 
 def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
@@ -144,27 +186,32 @@ def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     """
     n = robot.bodies
     q = all_coordinates(robot.followers, q)
-    frames = [placement_in_parent(robot, i, q[i]) for i in range(n)]
+    frames = []
+    for i in range(n):
+        with jax.named_scope(f"frame_{i}"):
+            frames.append(placement_in_parent(robot, i, q[i]))
     bodies = composite_bodies(robot, p, frames)
     zero = jnp.zeros(())
     M: list[list] = [[zero] * n for _ in range(n)]
     for i in reversed(range(n)):
         m, h, J = bodies[i]
         axis = robot.axis[i]
-        if robot.turns[i]:
-            force = -jnp.cross(h, axis)
-            moment = J @ axis
-        else:
-            force = m * axis
-            moment = jnp.cross(h, axis)
+        with jax.named_scope(f"start_{i}"):
+            if robot.turns[i]:
+                force = -jnp.cross(h, axis)
+                moment = J @ axis
+            else:
+                force = m * axis
+                moment = jnp.cross(h, axis)
         # Every joint on the way to the ground feels the wrench.
         j = i
         while j >= 0:
-            component = moment if robot.turns[j] else force
-            M[i][j] = M[j][i] = jnp.dot(robot.axis[j], component)
             R, r = frames[j]
-            force = R @ force
-            moment = R @ moment + jnp.cross(r, force)
+            with jax.named_scope(f"entry_{i}_{j}"):
+                component = moment if robot.turns[j] else force
+                M[i][j] = M[j][i] = jnp.dot(robot.axis[j], component)
+                force = R @ force
+                moment = R @ moment + jnp.cross(r, force)
             j = robot.parent[j]
     rows = on_coordinates(robot.followers, jnp.stack([jnp.stack(row) for row in M]))
     return on_coordinates(robot.followers, rows.T).T
@@ -184,15 +231,16 @@ def composite_bodies(
             continue
         m, h, J = bodies[i]
         R, r = frames[i]
-        h = R @ h
-        # Steiner, with r x h terms since h is measured from the body's own origin.
-        r_cross = skew(r)
-        h_cross = skew(h)
-        shift = r_cross @ h_cross + h_cross @ r_cross + m * (r_cross @ r_cross)
-        J = R @ J @ R.T - shift
-        h = h + m * r
-        m_parent, h_parent, J_parent = bodies[parent]
-        bodies[parent] = (m_parent + m, h_parent + h, J_parent + J)
+        with jax.named_scope(f"composite_{i}"):
+            h = R @ h
+            # Steiner, with r x h terms since h is measured from the body's own origin.
+            r_cross = skew(r)
+            h_cross = skew(h)
+            shift = r_cross @ h_cross + h_cross @ r_cross + m * (r_cross @ r_cross)
+            J = R @ J @ R.T - shift
+            h = h + m * r
+            m_parent, h_parent, J_parent = bodies[parent]
+            bodies[parent] = (m_parent + m, h_parent + h, J_parent + J)
     return bodies
 
 

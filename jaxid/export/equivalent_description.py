@@ -49,7 +49,7 @@ class Description(NamedTuple):
         motions = projection_equation.body_motions(self.robot, q, qd, qdd)
         pairs = zip(self.bodies, motions, strict=True)
         wrenches = [_wrench(inertia, *motion) for inertia, motion in pairs]
-        return projection_equation.joint_forces(self.robot, wrenches, q, qd, qdd)
+        return projection_equation.joint_forces(self.robot, wrenches, q)
 
     def carry_inward(self) -> "Description":
         """Move what moves like the parent to the parent: base parameters (Eq. 22).

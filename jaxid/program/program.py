@@ -80,6 +80,8 @@ class Program:
     # shapes of the outputs, without batch axes
     output_shapes: Shapes
     structure: Any = field(repr=False)  # tree structure of the function's result
+    # for each node the `jax.named_scope` of the function in which it was made
+    labels: tuple[str, ...] = field(default=(), repr=False)
 
     @functools.cached_property
     def counts(self) -> OperationCounts:
@@ -188,7 +190,10 @@ def assemble(
             operands = tuple(map(reference, operands))
         nodes.append(Node(scalar.operation, operands))
     results = tuple(map(reference, outputs))
-    return Program(input_shapes, tuple(nodes), results, output_shapes, structure)
+    labels = tuple(scalar.label for scalar in scalars)
+    return Program(
+        input_shapes, tuple(nodes), results, output_shapes, structure, labels
+    )
 
 
 def record(program: Program, graph: Graph) -> list[Scalar]:

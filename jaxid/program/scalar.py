@@ -98,12 +98,13 @@ class Operation(enum.StrEnum):
 
 
 class Graph:
-    """Expressions of one trace, without repetitions."""
+    """Expressions of one trace, without repetitions; new ones get its label."""
 
-    __slots__ = ("_table",)
+    __slots__ = ("_table", "label")
 
     def __init__(self):
         self._table = {}
+        self.label = ""
 
     def node(self, operation: Operation, *operands: object) -> "Scalar":
         """Return the expression, numbered in order when it is first needed."""
@@ -118,13 +119,14 @@ class Graph:
 class Scalar:
     """A scalar operation in a `Graph`; equal ones are identical."""
 
-    __slots__ = ("graph", "index", "operands", "operation")
+    __slots__ = ("graph", "index", "label", "operands", "operation")
 
     def __init__(self, graph: Graph, operation: Operation, operands: tuple, index: int):
         self.graph = graph
         self.operation = operation
         self.operands = operands
         self.index = index
+        self.label = graph.label
 
     def __repr__(self):
         return f"<{self.operation} {self.index}>"

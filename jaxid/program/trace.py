@@ -378,8 +378,13 @@ def _as_constant(constant: object):
     return np.asarray(constant)
 
 
-def _run(jaxpr: Jaxpr, constants: list, arguments: Arrays):
-    """Run a jaxpr on arrays of scalars or numbers, one equation after the other."""
+def _run(
+    graph: Graph, label: str, jaxpr: Jaxpr, constants: list, arguments: Arrays
+) -> Arrays:
+    """Run a jaxpr on arrays of scalars or numbers, one equation after the other.
+
+    New scalars get the label, or the `jax.named_scope` of their equation.
+    """
     values: dict[Any, np.ndarray] = {}
     for name, constant in zip(jaxpr.constvars, constants, strict=True):
         values[name] = _as_constant(constant)
@@ -390,7 +395,8 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: Arrays):
 
     for equation in jaxpr.eqns:
         operands = [read(name) for name in equation.invars]
-        results = _run_equation(equation, operands)
+        graph.label = label or str(equation.source_info.name_stack)
+        results = _run_equation(graph, equation, operands)
         # Entries of a symbolic array may all have become numbers; it stays symbolic.
         dtype = object if any(map(_is_symbolic, operands)) else None
         for name, result in zip(equation.outvars, results, strict=True):
@@ -398,14 +404,14 @@ def _run(jaxpr: Jaxpr, constants: list, arguments: Arrays):
     return [read(name) for name in jaxpr.outvars]
 
 
-def _run_equation(equation: JaxprEqn, operands: Arrays):
+def _run_equation(graph: Graph, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Run one equation: a call of another jaxpr, a move of entries, or arithmetic."""
     name = equation.primitive.name
     jaxpr = _called_jaxpr(equation)
     if jaxpr is not None:
         if isinstance(jaxpr, ClosedJaxpr):
-            return _run(jaxpr.jaxpr, jaxpr.consts, operands)
-        return _run(jaxpr, [], operands)
+            return _run(graph, graph.label, jaxpr.jaxpr, jaxpr.consts, operands)
+        return _run(graph, graph.label, jaxpr, [], operands)
     if name in _MOVEMENTS:
         return _as_list(equation, _MOVEMENTS[name](*operands, **equation.params))
     if name == "convert_element_type":
@@ -446,7 +452,7 @@ def trace(function: Callable, *inputs: Shape | np.ndarray) -> Program:
         avals = [jax.ShapeDtypeStruct(shape, np.float64) for shape in input_shapes]
         make_jaxpr = jax.make_jaxpr(function, return_shape=True)
         jaxpr, result = make_jaxpr(*avals)
-        leaves = _run(jaxpr.jaxpr, jaxpr.consts, arguments)
+        leaves = _run(graph, "", jaxpr.jaxpr, jaxpr.consts, arguments)
 
     outputs = []
     for leaf in leaves:
