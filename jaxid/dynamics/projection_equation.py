@@ -9,6 +9,7 @@ the same factors, it is taken from them: the velocity of the origin itself is ne
 formed. Everything else is a derivative of this recursion.
 """
 
+from collections.abc import Iterator
 from typing import Any
 
 import jax
@@ -63,11 +64,14 @@ def body_motions(
     return motions
 
 
-def partial_velocities(robot: Robot, q: Joints) -> list[dict[int, AnyArray]]:
-    r"""Return $\partial (v_o, \omega)_i / \partial \dot q_j$, rows of $F_{o,i}^T$.
+def partial_velocities(
+    robot: Robot, q: Joints
+) -> Iterator[tuple[int, int, AnyArray]]:
+    r"""Yield $\partial (v_o, \omega)_i / \partial \dot q_j$, the rows of $F_{o,i}^T$.
 
-    Returns:
-        For each body the rows of the joints that move it (Eqs. 5, 7).
+    Yields:
+        For each body and each joint that moves it their numbers and the row (Eqs. 5,
+        7).
     """
     q = all_coordinates(robot.followers, q)
     rows: list[dict[int, AnyArray]] = [{} for _ in range(robot.bodies)]
@@ -85,7 +89,8 @@ def partial_velocities(robot: Robot, q: Joints) -> list[dict[int, AnyArray]]:
         axis = robot.axis[i]
         directions = [np.zeros(3), axis] if robot.turns[i] else [axis, np.zeros(3)]
         rows[i][i] = jnp.concatenate(directions)
-    return rows
+        for j, row in rows[i].items():
+            yield i, j, row
 
 
 def momentum_matrix(w: Vector3) -> AnyArray:
@@ -127,16 +132,15 @@ def rigid_body_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> An
         For each joint (first axis) the columns of each body (second axis).
     """
     n = robot.bodies
-    motions = body_motions(robot, q, qd, qdd)
-    partials = partial_velocities(robot, q)
+    bodies = []
+    for i, motion in enumerate(body_motions(robot, q, qd, qdd)):
+        with jax.named_scope(f"body_{i}"):
+            bodies.append(body_regressor(*motion))
     columns: list[list] = [[jnp.zeros(10)] * n for _ in range(n)]
-    for i in range(n):
-        with jax.named_scope(f"motion_{i}"):
-            body = body_regressor(*motions[i])
-        for j, row in partials[i].items():
-            with jax.named_scope(f"row_{i}_{j}"):
-                columns[j][i] = row @ body
-    rows = jnp.stack([jnp.stack(bodies) for bodies in columns])
+    for i, j, row in partial_velocities(robot, q):
+        with jax.named_scope(f"columns_{i}_{j}"):
+            columns[j][i] = row @ bodies[i]
+    rows = jnp.stack([jnp.stack(blocks) for blocks in columns])
     return on_coordinates(robot.followers, rows)
 
 
@@ -146,7 +150,7 @@ def rigid_body_forces(
     r"""Return the forces $\sum_i F_{o,i}^T \bar\Theta_i p_i$ [N m or N] (Eq. 11)."""
     wrenches = []
     for i, motion in enumerate(body_motions(robot, q, qd, qdd)):
-        with jax.named_scope(f"motion_{i}"):
+        with jax.named_scope(f"wrench_{i}"):
             wrenches.append(body_regressor(*motion) @ p[i])
     return joint_forces(robot, wrenches, q)
 
