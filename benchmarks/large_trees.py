@@ -103,9 +103,7 @@ def floating(file: str) -> PinocchioTree:
     for kind in ("PX", "PY", "PZ", "RX", "RY", "RZ"):
         model = getattr(pin, f"JointModel{kind}")()
         joint = base.addJoint(joint, model, pin.SE3.Identity(), f"base {kind}")
-    frame = pin.Frame(
-        "base", joint, pin.SE3.Identity(), pin.FrameType.OP_FRAME
-    )
+    frame = pin.Frame("base", joint, pin.SE3.Identity(), pin.FrameType.OP_FRAME)
     base.addFrame(frame)
     legs = pin.buildModelFromXML(xml)
     place = base.getFrameId("base")
@@ -286,7 +284,10 @@ def work(name: str, function: str, samples: int) -> None:
         for k in range(LOOP):
             stored[k] = result.loop(k)
 
-    cases = {"ours": lambda: jax.block_until_ready(result.ours(*result.arguments)), "loop": loop}
+    cases = {
+        "ours": lambda: jax.block_until_ready(result.ours(*result.arguments)),
+        "loop": loop,
+    }
     times = timing.interleaved(cases, 7)
     figures = {
         "compile": compiling,

@@ -23,7 +23,7 @@ from jaxid.program import (
     on_any_platform,
     packed_entries,
 )
-from jaxid.program.xla_sample_blocks import row_products
+from jaxid.program.xla_sample_blocks import distinct_rows, row_products
 
 from .sample_methods import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
 
@@ -202,4 +202,6 @@ def _places(program: Program):
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
 def _compiled(program: Program):
+    if program.loops is not None:
+        return jax.jit(lambda *x: distinct_rows(program, *(a.T for a in x)))
     return jax.jit(functools.partial(on_any_platform, program, Lowered.distinct))

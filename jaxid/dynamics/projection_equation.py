@@ -3,10 +3,9 @@ r"""The Projection Equation for one sample, on 3-vectors (Eqs. 1-12), written on
 One recursion from the ground to the tips gives every body's angular velocity, angular
 acceleration and the acceleration $a = \dot v_o + \tilde\omega v_o - g$ of its origin,
 in the body's own frame. That is all that the regressor of a body needs (Eq. 10). The
-Jacobian that projects it into the space of the joints (Eqs. 5-7) is $\partial (v_o,
-\omega) / \partial \dot q$, and since $a$ and $\dot\omega$ are affine in $\ddot q$ with
-the same factors, it is taken from them: the velocity of the origin itself is never
-formed. Everything else is a derivative of this recursion.
+velocity of the origin itself is never formed: the Jacobian that projects it into the
+space of the joints (Eqs. 5-7) is carried from body to body like a velocity. The scopes
+name what is equal for all bodies but for its numbers, see `program.equal_parts`.
 """
 
 from collections.abc import Iterator
@@ -64,9 +63,7 @@ def body_motions(
     return motions
 
 
-def partial_velocities(
-    robot: Robot, q: Joints
-) -> Iterator[tuple[int, int, AnyArray]]:
+def partial_velocities(robot: Robot, q: Joints) -> Iterator[tuple[int, int, AnyArray]]:
     r"""Yield $\partial (v_o, \omega)_i / \partial \dot q_j$, the rows of $F_{o,i}^T$.
 
     Yields:

@@ -6,6 +6,7 @@ were used last are kept. Derivatives take the model's spatial form, which is a s
 program on whole arrays.
 """
 
+import dataclasses
 import functools
 import math
 import threading
@@ -29,6 +30,7 @@ from jaxid.arrays import (
 )
 from jaxid.errors import InputError
 from jaxid.program import Program, Shape, evaluate, trace
+from jaxid.program.equal_parts import find_equal_parts
 from jaxid.program.jax_transformation_rules import with_derivatives_of
 from jaxid.program.xla_sample_blocks import BLOCK, on_rows
 
@@ -93,12 +95,32 @@ def opened(
     return open_model, concatenate(numbers, axis=1)
 
 
+def with_open_numbers(model: eqx.Module, method: str) -> tuple[OpenModel, np.ndarray]:
+    """Return a method with all numbers of the model except 0, 1 and -1 as inputs."""
+    places = []
+    numbers = [np.zeros(0)]
+    for k, leaf in enumerate(jax.tree.leaves(model)):
+        if not isinstance(leaf, np.ndarray) or leaf.dtype.kind != "f":
+            continue
+        entries = leaf.ravel()
+        is_open = np.isfinite(entries) & ~np.isin(entries, (0.0, 1.0, -1.0))
+        positions = np.flatnonzero(is_open)
+        if len(positions):
+            places.append((k, tuple(positions.tolist())))
+            numbers.append(entries[positions])
+    return OpenModel(model, method, tuple(places)), np.concatenate(numbers)
+
+
 MAX_SAMPLES_IN_NUMPY = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
 CACHE_SIZE = 64
 """Number of programs that are kept, of the models that were used last."""
 MAX_JOINTS = {"inertia": 16, "acceleration": 16}
 """Joints up to which a program that grows with their square is compiled."""
+MAX_OPERATIONS = 2000
+"""Operations up to which XLA compiles a program in one piece, some 4 ms for each."""
+MIN_REPETITION = 8
+"""Ratio of operations from which loops pay: each turn moves values to and fro."""
 
 
 def spatial_form(owner: Any) -> Any:
@@ -134,7 +156,20 @@ class SampleMethod:
             program = derive(self.definition.__name__, *self.shapes)
             if program is not None:
                 return program
-        return trace(self.definition, *self.shapes)
+        program = trace(self.definition, *self.shapes)
+        is_method = getattr(self.definition, "__self__", None) is self.owner
+        if program.counts.total <= MAX_OPERATIONS or not is_method:
+            return program
+        return self._in_loops(program)
+
+    def _in_loops(self, program: Program) -> Program:
+        """Return a long program with the loops over its equal parts."""
+        model, numbers = with_open_numbers(self.owner, self.definition.__name__)
+        open_program = trace(model.call, numbers.shape, *self.shapes)
+        loops = find_equal_parts(open_program, numbers)
+        if loops is None or loops.repetition < MIN_REPETITION:
+            return program
+        return dataclasses.replace(program, loops=loops)
 
     @functools.cached_property
     def spatial_definition(self) -> Callable:

@@ -73,11 +73,25 @@ class Loops(NamedTuple):
 
     Attributes:
         loops: Loops in their order.
-        results: Row of each entry of the packed result; 0 for a constant.
+        constants: Constants of the packed result, whose rows follow those of the
+            inputs.
+        results: Row of each entry of the packed result.
     """
 
     loops: tuple[Loop, ...]
+    constants: np.ndarray
     results: np.ndarray
+
+    @property
+    def repetition(self) -> float:
+        """Operations of all turns, relative to those of the different parts."""
+        run = 0
+        compiled = 0
+        for loop in self.loops:
+            operations = np.array([part.counts.total for part in loop.programs])
+            run += operations[loop.choices].sum()
+            compiled += operations.sum()
+        return run / compiled
 
 
 def find_equal_parts(program: Program, numbers: np.ndarray) -> Loops | None:
@@ -93,11 +107,18 @@ def find_equal_parts(program: Program, numbers: np.ndarray) -> Loops | None:
     """
     constants = _constants(program, numbers)
     names = _names(program, constants)
+    try:
+        groups = list(_turns_of_loops(program, names))
+    except graphlib.CycleError:
+        return None
     shared_nodes = _shared_nodes(program, names)
     rows = _input_rows(program)
-    start = sum(math.prod(shape) for shape in program.input_shapes[1:])
+    values = [constants.get(x) if isinstance(x, int) else x for x in program.outputs]
+    constant_results = sorted({x for x in values if x is not None})
+    inputs = sum(math.prod(shape) for shape in program.input_shapes[1:])
+    start = inputs + len(constant_results)
     loops = []
-    for turns in _turns_of_loops(program, names):
+    for turns in groups:
         parts = [_part(program, positions, constants) for positions in turns]
         results = _results(parts, shared_nodes)
         size = max(map(len, results.values()))
@@ -123,12 +144,17 @@ def find_equal_parts(program: Program, numbers: np.ndarray) -> Loops | None:
         )
         loops.append(loop)
         start = loop.stop
-    entries = [rows.get(x, 0) if isinstance(x, int) else 0 for x in program.outputs]
-    return Loops(tuple(loops), np.array(entries, np.int32))
+    entries = []
+    for reference, value in zip(program.outputs, values, strict=True):
+        if value is None:
+            entries.append(rows[reference])
+        else:
+            entries.append(inputs + constant_results.index(value))
+    return Loops(tuple(loops), np.array(constant_results), np.array(entries, np.int32))
 
 
 def _constants(program: Program, numbers: np.ndarray):
-    """Return the values of the nodes that depend on numbers only, by their positions."""
+    """Return values of the nodes that depend on numbers only, by their positions."""
     constants: dict[int, float] = {}
     for position, node in enumerate(program.nodes):
         if node.operation is Operation.INPUT:
@@ -136,7 +162,9 @@ def _constants(program: Program, numbers: np.ndarray):
             if number == 0:
                 constants[position] = float(numbers[entry])
         elif all(x in constants for x in node.uses):
-            operands = [constants[x] if isinstance(x, int) else x for x in node.operands]
+            operands = [
+                constants[x] if isinstance(x, int) else x for x in node.operands
+            ]
             constants[position] = node.operation.on_constants(*operands)
     return constants
 

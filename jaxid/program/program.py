@@ -1,5 +1,6 @@
 """A scalar program: a sequence of scalar operations, and its results."""
 
+import dataclasses
 import functools
 import itertools
 import math
@@ -82,6 +83,8 @@ class Program:
     structure: Any = field(repr=False)  # tree structure of the function's result
     # for each node the `jax.named_scope` of the function in which it was made
     labels: tuple[str, ...] = field(default=(), repr=False)
+    # the same program as loops over its equal parts (`Loops`), or None
+    loops: Any = field(default=None, repr=False)
 
     @functools.cached_property
     def counts(self) -> OperationCounts:
@@ -212,6 +215,11 @@ def select_outputs(program: Program, entries: np.ndarray) -> Program:
     scalars = record(program, Graph())
     references = [program.outputs[k] for k in entries.ravel()]
     outputs = [scalars[x] if isinstance(x, int) else x for x in references]
-    return assemble(
+    selection = assemble(
         program.input_shapes, outputs, (entries.shape,), jax.tree.structure(0)
     )
+    if program.loops is None:
+        return selection
+    rows = program.loops.results[entries.ravel()]
+    loops = program.loops._replace(results=rows)
+    return dataclasses.replace(selection, loops=loops)

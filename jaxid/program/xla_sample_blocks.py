@@ -13,6 +13,7 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax.custom_batching import custom_vmap
 
 from jaxid.arrays import Array, Float
@@ -21,6 +22,7 @@ from .gpu_kernel import in_kernel, suits_kernel
 from .jax_transformation_rules import TRUE, differing_alike
 from .program import Program
 from .xla import Results, fenced, hidden_one, lower
+from .xla_loops import empty_rows, entry_rows, rows_of
 
 BLOCK = 256
 """Samples of one evaluation."""
@@ -81,6 +83,17 @@ def _repeat(columns: Sequence, count: int):
     return entries
 
 
+def _pack_block(program: Program, values: Array, *arrays: Array) -> tuple[Rows, Array]:
+    """Return the packed result of a block of samples, and the rows of `entry_rows`."""
+    if program.loops is None:
+        return _pack(block_results, program, *arrays), values
+    values = entry_rows(program, values, *arrays)
+    # Transposed first: entries of a sample are near each other then.
+    columns = values.T
+    results = program.loops.results
+    return columns.at[:, results].get(mode="promise_in_bounds"), values
+
+
 def _pack(results: Callable[..., Results], program: Program, *arrays: Array):
     """Return distinct results in the order of the packed result, with its constants."""
     columns = []
@@ -93,21 +106,25 @@ def _pack(results: Callable[..., Results], program: Program, *arrays: Array):
 def _in_blocks(program: Program, *arrays: Array):
     """Return the packed result of each sample, block by block."""
     count = len(arrays[-1])
+    reference = arrays[-1][0, 0]
+    values = empty_rows(program, min(count, BLOCK), reference)
     if count <= BLOCK:
-        return _pack(block_results, program, *arrays)
+        return _pack_block(program, values, *arrays)[0]
 
-    def step(k, out):
+    def step(k, state):
+        out, values = state
         # The last block begins earlier, so that it is as long as the others.
         start = jnp.minimum(k * BLOCK, count - BLOCK)
         parts = [_slice_samples(x, start, BLOCK) for x in arrays]
-        block = _pack(block_results, program, *parts)
-        return jax.lax.dynamic_update_slice_in_dim(out, block, start, axis=0)
+        block, values = _pack_block(program, values, *parts)
+        out = jax.lax.dynamic_update_slice_in_dim(out, block, start, axis=0)
+        return out, values
 
     # All of it is overwritten.
     shape = (count, len(program.outputs))
-    initial_results = jnp.broadcast_to(arrays[-1][0, 0], shape)
+    initial_results = jnp.broadcast_to(reference, shape)
     blocks = math.ceil(count / BLOCK)
-    return jax.lax.fori_loop(0, blocks, step, initial_results)
+    return jax.lax.fori_loop(0, blocks, step, (initial_results, values))[0]
 
 
 def _slice_samples(x: Array, start: Array, size: int):
@@ -194,7 +211,19 @@ def row_products(
             matrices.append(matrix @ matrix.T)
         return matrices
 
-    def by_chunks(evaluate, size, *arrays):
+    def rows_of_block(program, *parts):
+        values = empty_rows(program, len(parts[-1]), parts[-1][0, 0])
+        return entry_rows(program, values, *parts)
+
+    def products_of_rows(values, counts):
+        matrices = []
+        for group in groups:
+            rows = rows_of(program, values, np.array(group, int))
+            matrix = counts[None] * rows
+            matrices.append(matrix @ matrix.T)
+        return matrices
+
+    def by_chunks(evaluate, products, size, *arrays):
         def step(k, sums):
             # The last chunk begins earlier; samples that were counted do not count
             # again.
@@ -214,8 +243,42 @@ def row_products(
         chunks = math.ceil(count / size)
         return jax.lax.fori_loop(0, chunks, step, initial_results)
 
+    on_cpu = (block_results, products)
+    if program.loops is not None:
+        on_cpu = (rows_of_block, products_of_rows)
     return jax.lax.platform_dependent(
         *differing_alike(arrays),
-        cpu=functools.partial(by_chunks, block_results, min(BLOCK, count)),
-        default=functools.partial(by_chunks, results_at_once, min(2**16, count)),
+        cpu=functools.partial(by_chunks, *on_cpu, min(BLOCK, count)),
+        default=functools.partial(
+            by_chunks, results_at_once, products, min(2**16, count)
+        ),
     )
+
+
+def distinct_rows(program: Program, *arrays: Array) -> Results:
+    """Return the distinct results of many samples from loops, block by block.
+
+    Inputs are [samples, entries].
+    """
+    count = len(arrays[-1])
+    size = min(BLOCK, count)
+    numbers = program.distinct[1]
+    _, first_entries = np.unique(numbers[numbers >= 0], return_index=True)
+    entries = np.flatnonzero(numbers >= 0)[first_entries]
+
+    def step(k, state):
+        out, values = state
+        start = jnp.minimum(k * size, count - size)
+        parts = [_slice_samples(x, start, size) for x in arrays]
+        values = entry_rows(program, values, *parts)
+        rows = rows_of(program, values, entries)
+        out = jax.lax.dynamic_update_slice_in_dim(out, rows, start, axis=1)
+        return out, values
+
+    arrays = differing_alike(arrays)
+    reference = arrays[-1][0, 0]
+    initial_results = jnp.broadcast_to(reference, (len(entries), count))
+    values = empty_rows(program, size, reference)
+    blocks = math.ceil(count / size)
+    results, _ = jax.lax.fori_loop(0, blocks, step, (initial_results, values))
+    return tuple(results)

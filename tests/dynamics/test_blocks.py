@@ -7,6 +7,7 @@ import pytest
 from trees import random_tree
 
 import jaxid as jid
+from jaxid.dynamics import sample_methods
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.sample_methods import in_numpy, program_of, spatial_form
 
@@ -200,3 +201,25 @@ def test_eager_results_have_the_precision_of_compiled_ones(dtype):
     p = jnp.asarray(P, dtype)
     compiled = jax.jit(MODEL.inverse_dynamics)(p, x)
     assert MODEL.inverse_dynamics(p, x).dtype == compiled.dtype == dtype
+
+
+def test_a_long_chain_runs_in_loops_over_equal_parts(monkeypatch):
+    monkeypatch.setattr(sample_methods, "MAX_OPERATIONS", 100)
+    monkeypatch.setattr(sample_methods, "MIN_REPETITION", 1)
+    tree = random_tree(5, 6)
+    model = jid.Model(tree.robot(), (jid.RigidBodies(), jid.ViscousFriction()))
+    p = np.random.default_rng(1).normal(size=model.size)
+    x = motion(300, joints=6)
+    given = x.q, x.qd, x.qdd
+    forces = in_numpy(model, model.forces, *given, shared=(p,))
+    columns = in_numpy(model, model.columns, *given)
+    assert program_of(model, model.columns, (6,), (6,), (6,)).loops is not None
+    assert program_of(model, model.forces, p.shape, (6,), (6,), (6,)).loops is not None
+    found = jax.jit(model.inverse_dynamics)(p, in_jax(x))
+    np.testing.assert_allclose(found, forces, rtol=1e-11, atol=1e-11)
+    np.testing.assert_allclose(jax.jit(model.regressor)(in_jax(x)), columns, atol=1e-11)
+    rows = columns.reshape(-1, model.size)
+    np.testing.assert_allclose(model.gram(x), rows.T @ rows, rtol=1e-10, atol=1e-9)
+    packed = jax.jit(lambda x: model.packed_regressor(x).values)(in_jax(x))
+    eager = model.packed_regressor(x).values
+    np.testing.assert_allclose(np.stack(packed), np.stack(eager), atol=1e-11)
