@@ -5,7 +5,7 @@ every motion.
 """
 
 import functools
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import equinox as eqx
 import jax
@@ -141,14 +141,15 @@ class PackedRegressor(eqx.Module):
     into the `matrix`.
 
     Attributes:
-        values: Distinct entries that vary with the motion, over the samples.
+        values: Distinct entries that vary with the motion, over the samples: arrays,
+            or the rows of a matrix for a robot of many joints.
         places: For each joint the pairs of a column and either the number of its array
             in `values` or its constant, a float.
         samples: Number of samples.
         columns: Number of parameters.
     """
 
-    values: tuple[Float[AnyArray, " samples"], ...]
+    values: Sequence[Float[AnyArray, " samples"]]
     places: Places = eqx.field(static=True)
     samples: int = eqx.field(static=True)
     columns: int = eqx.field(static=True)
@@ -162,7 +163,7 @@ class PackedRegressor(eqx.Module):
         self.samples = len(samples[0])
         self.columns = program.output_shapes[0][1]
         if self.samples > MAX_SAMPLES_IN_NUMPY or is_traced(arrays):
-            self.values = tuple(_compiled(program)(*arrays))
+            self.values = _compiled(program)(*arrays)
         else:
             self.values = tuple(evaluate_rows(program, *arrays))
 
@@ -173,7 +174,7 @@ class PackedRegressor(eqx.Module):
         sample.
         """
         values = jax.device_get(self.values)
-        dtype = np.result_type(*(x.dtype for x in self.values), np.float32)
+        dtype = np.result_type(np.float32, *{x.dtype for x in values})
         joints = len(self.places)
         shape = (self.columns, joints, self.samples)
         matrix = np.zeros(shape, dtype)

@@ -255,7 +255,7 @@ def row_products(
     )
 
 
-def distinct_rows(program: Program, *arrays: Array) -> Results:
+def distinct_rows(program: Program, *arrays: Array) -> Array:
     """Return the distinct results of many samples from loops, block by block.
 
     Inputs are [samples, entries].
@@ -281,4 +281,4 @@ def distinct_rows(program: Program, *arrays: Array) -> Results:
     values = empty_rows(program, size, reference)
     blocks = math.ceil(count / size)
     results, _ = jax.lax.fori_loop(0, blocks, step, (initial_results, values))
-    return tuple(results)
+    return results
