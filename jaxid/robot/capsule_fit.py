@@ -25,6 +25,13 @@ FIRST_SHIFT = 0.1
 """First shift of an axis in a search, relative to the size of the points."""
 
 
+class UnreadShapes(NamedTuple):
+    """Body of a link whose geometry cannot be read, and why."""
+
+    body: int  # -1 is the ground
+    reason: str
+
+
 def fit_capsules(
     path: str | Path,
     *,
@@ -34,7 +41,7 @@ def fit_capsules(
     base_position: Numbers = ORIGIN,
     xacro_arguments: Mapping[str, str] | None = None,
     packages: str | Path | None = None,
-    faults: dict[str, str] | None = None,
+    faults: dict[str, UnreadShapes] | None = None,
 ) -> tuple[Capsule, ...]:
     """Fit capsules around the collision geometry of a URDF or MJCF file.
 
@@ -55,8 +62,8 @@ def fit_capsules(
         xacro_arguments: As in `load_urdf`.
         packages: Folder that holds the packages of `package://` paths. If None, they
             are searched in the folders above the file.
-        faults: Dictionary for why a link's geometry cannot be read, by link; if None,
-            that is an error.
+        faults: Dictionary for the links whose geometry cannot be read; if None, that is
+            an error.
 
     Raises:
         FileNotFoundError: If the file or a mesh does not exist.
@@ -111,7 +118,7 @@ def placed_shapes(
     mount: np.ndarray,
     place: np.ndarray,
     packages: str | Path | None = None,
-    faults: dict[str, str] | None = None,
+    faults: dict[str, UnreadShapes] | None = None,
 ) -> Iterator[LinkShapes]:
     """Yield the shapes of each link of a file whose base is mounted on the ground.
 
@@ -135,7 +142,7 @@ def placed_shapes(
         except (OSError, InputError) as error:
             if faults is None:
                 raise
-            faults[link] = str(error)
+            faults[link] = UnreadShapes(body, str(error))
             shapes = []
         yield LinkShapes(link, body, rotation, position, shapes)
 

@@ -9,7 +9,11 @@ import numpy as np
 from jaxid.arrays import Texts
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
-from jaxid.robot.capsule_fit import fit_capsules, stand_in_capsules
+from jaxid.robot.capsule_fit import (
+    UnreadShapes,
+    fit_capsules,
+    stand_in_capsules,
+)
 from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
 from jaxid.robot.limits_and_drives import owners
 from jaxid.robot.robot import Robot
@@ -94,13 +98,17 @@ class Collision:
         Raises:
             InputError: If shapes cannot be made, or a name is unknown.
         """
+        user_capsules = []
+        for body, shape in self.capsules:
+            number = GROUND if body == "ground" else joint_number(robot, body)
+            user_capsules.append(dataclasses.replace(shape, body=number))
         capsules = []
         faults = []
         if self.fit and robot_file is not None:
-            capsules, faults = fit_links(robot_file, self.packages)
-        for body, shape in self.capsules:
-            number = GROUND if body == "ground" else joint_number(robot, body)
-            capsules.append(dataclasses.replace(shape, body=number))
+            # The user's shapes replace what the file does not tell of a body.
+            known_bodies = {capsule.body for capsule in user_capsules}
+            capsules, faults = fit_links(robot_file, self.packages, known_bodies)
+        capsules += user_capsules
         obstacles: list[Box | HalfSpace] = list(self.boxes)
         if self.floor in ("base", True):
             obstacles.append(base_plane or HalfSpace("floor"))
@@ -128,10 +136,16 @@ class Collision:
 
 
 def fit_links(
-    robot_file: RobotFile, packages: str | None
+    robot_file: RobotFile, packages: str | None, known_bodies: set[int]
 ) -> tuple[list[Capsule], list[str]]:
-    """Return capsules around the robot file's geometry, and what cannot be read."""
-    faults: dict[str, str] = {}
+    """Return capsules around the robot file's geometry, and what cannot be read.
+
+    Args:
+        robot_file: Robot file.
+        packages: Folder of its packages.
+        known_bodies: Bodies whose shape is known otherwise.
+    """
+    faults: dict[str, UnreadShapes] = {}
     capsules = fit_capsules(
         robot_file.path,
         packages=packages,
@@ -142,10 +156,12 @@ def fit_links(
     # Links with the same fault share a sentence.
     links_by_fault: dict[str, list[str]] = {}
     for link, fault in faults.items():
-        links_by_fault.setdefault(fault, []).append(link)
+        if fault.body not in known_bodies:
+            links_by_fault.setdefault(fault.reason, []).append(link)
     sentences = [
-        f"{owners('link', names)}: geometry not read ({fault.rstrip('.')})"
-        for fault, names in links_by_fault.items()
+        f"{owners('link', names)}: geometry not read ({reason.rstrip('.')}); give "
+        "`capsules` of this body in `[collision]`, or the file"
+        for reason, names in links_by_fault.items()
     ]
     return list(capsules), sentences
 
