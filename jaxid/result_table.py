@@ -225,7 +225,7 @@ class Column:
         if self.kind == "number":
             return self.width
         words = " ".join((*self.header, *self.texts)).split()
-        return max(min(self.width, MIN_TEXT_WIDTH), *map(len, words))
+        return max([min(self.width, MIN_TEXT_WIDTH), *map(len, words)])
 
     @property
     def width(self) -> int:

@@ -385,11 +385,11 @@ def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):
 
 def test_capsules_of_the_user_replace_meshes_that_are_missing(tmp_path):
     mesh = '<collision><geometry><mesh filename="none.stl"/></geometry></collision>'
-    capsule = 'start = [0, 0, 0], end = [0, 0, 0.4], radius = 0.05 }'
+    capsule = "start = [0, 0, 0], end = [0, 0, 0.4], radius = 0.05 }"
     keys = "".join(f'{{ name = "c{k}", body = "j{k}", {capsule},' for k in (1, 2))
     path = arm(tmp_path, shape=mesh, keys=f"[collision]\ncapsules = [{keys}]\n")
     experiment = load_experiment(path)
-    surroundings = experiment.surroundings()
+    surroundings = experiment.surroundings
     # The third link still has no shape.
     assert [fault.split(":")[0] for fault in surroundings.faults[:1]] == ["link `l3`"]
     assert "give `capsules`" in surroundings.faults[0]

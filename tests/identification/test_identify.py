@@ -172,7 +172,7 @@ def test_ridge_solves_its_normal_equations_and_says_what_it_pulls(base, noisy):
     np.testing.assert_allclose(fit.parameters, x / scale, rtol=1e-9)
     ridge = jid.estimators.LeastSquares(jid.estimators.Ridge(0.3))
     (note,) = jid.identify(base, noisy, ridge).notes
-    assert f"of {base.size} directions" in note
+    assert f"of {base.size} combinations of parameters" in note
 
 
 def test_cross_validation_pulls_only_where_data_are_poor(base, p):

@@ -170,7 +170,7 @@ def test_fits_with_weights_of_their_own_keep_them(base, truths, logs):
     ):
         with pytest.raises(
             ValueError,
-            match="have seen the same data, which would count twice",
+            match="contain the same data, which would count twice",
         ):
             twice()
 

@@ -131,5 +131,7 @@ def test_only_xacro_files_have_arguments(tmp_path):
 def test_a_program_that_does_not_end_is_stopped(install, monkeypatch):
     install("import time\ntime.sleep(9)")
     monkeypatch.setattr(xacro, "MAX_SECONDS", 0.2)
-    with pytest.raises(InputError, match=r"has not ended after 0.2 s: give a file"):
+    with pytest.raises(
+        InputError, match=r"has not ended after 0.2 s: give the expanded file"
+    ):
         jid.load_urdf("arm.urdf.xacro")

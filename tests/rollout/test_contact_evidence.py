@@ -80,7 +80,7 @@ def test_a_table_is_found_at_its_height():
     size = np.abs(errors.simulated[0] - errors.measured[0]).max(axis=0)
     assert np.median(size[table.below]) > 5 * np.median(size[~table.below])
     (finding,) = contact_findings(ROBOT, errors)
-    assert "hold the end-effector at a height of 0.09" in finding.text
+    assert "support the end-effector at a height of 0.09" in finding.text
 
 
 @pytest.mark.parametrize(

@@ -66,7 +66,9 @@ def test_samples_within_contacts_that_were_given_count_nowhere(fit):
     assert errors.total().max() < 1e-3
     inside = [(held.time >= a) & (held.time <= b) for a, b in spans]
     outside = ~np.any(inside, axis=0)
-    assert f"every sample but {np.sum(~outside)} within contacts" in str(errors)
+    assert f"every sample but {np.sum(~outside)} within the given contacts" in str(
+        errors
+    )
     (path,) = known.simulate(held)
     squares = (path - held.angles)[outside] ** 2
     np.testing.assert_allclose(errors.rms()[1], np.sqrt(squares.mean(axis=0)))
