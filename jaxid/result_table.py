@@ -404,7 +404,9 @@ class Table:
 
         grid = Grid(box=None, padding=(0, PADDING, 0, 0), pad_edge=False)
         cells: list[Any] = []
+        widths = []
         if self.status:
+            widths.append(1)
             grid.add_column(width=1)
             cells.append(map(_mark, self.status))
         folded_columns = [x for x in columns if x.width > x.min_width]
@@ -419,10 +421,11 @@ class Table:
                 # those behind it away.
                 texts = [text.rjust(width) for text in texts]
             grid.add_column(header, width=width, overflow="fold")
+            widths.append(width)
             cells.append(map(Text, texts))
 
         # Even these few columns may be wider than the terminal: nothing is cut then.
-        grid.width = sum(column.width + PADDING for column in grid.columns) - PADDING
+        grid.width = sum(widths) + PADDING * (len(widths) - 1)
         for k, row in enumerate(zip(*cells, strict=True)):
             if k in self.rules:
                 grid.add_row(*[Rule(style="dim")] * len(grid.columns))

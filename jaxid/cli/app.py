@@ -72,9 +72,9 @@ def demo(
     from jaxid.demo.results import DemoResult, write_study
     from jaxid.demo.study import run_study
 
-    with terminal.progress_bar() as progress:
+    with terminal.progress_bar(counts_all=True) as progress:
         study = run_study(seed, progress)
-        progress("writing the report", 0.0)
+        progress("writing the report", 0.95)
         files = write_study(output, study)
     terminal.show_result(console, detail, DemoResult(study), output, files)
 

@@ -114,10 +114,13 @@ def show_text(console: Console, text: str) -> None:
 
 
 @contextlib.contextmanager
-def progress_bar() -> Iterator[Progress]:
+def progress_bar(counts_all: bool = False) -> Iterator[Progress]:
     """Show one bar over all stages, and a line each ten seconds without a terminal.
 
     Each stage takes a part of what is left, so that the bar only grows.
+
+    Args:
+        counts_all: Whether fractions are of all stages together, not of each.
     """
     # Not needed by `--help`, which must answer at once.
     from rich.progress import Progress as Bar, SpinnerColumn
@@ -136,6 +139,8 @@ def progress_bar() -> Iterator[Progress]:
         stage_fraction = fraction
         part = LONG_PART if LONG_STAGES.search(stage) else SHORT_PART
         share = stage_start + part * (1.0 - stage_start) * fraction
+        if counts_all:
+            share = fraction
         bar.update(task.id, description=stage, completed=share)
 
     if console.is_terminal:

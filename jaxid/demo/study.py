@@ -9,6 +9,7 @@ import jax
 import numpy as np
 
 import jaxid as jid
+from jaxid.excitation.design import DesignProgress
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.validation.torque_errors import Validation
 
@@ -108,8 +109,11 @@ def run_study(
     periods: int = 2,
     motion: jid.trajectories.AbstractTrajectory | None = None,
 ) -> Study:
-    """Repeat the experiments of the paper."""
-    progress("finding base parameters", 0.0)
+    """Repeat the experiments of the paper.
+
+    Progress is that of the whole study, by the measured time of its stages.
+    """
+    progress("finding base parameters", 0.05)
     cold_robot = jid.simulation.virtual_tx90l_on_rail()
     warm_robot = jid.simulation.virtual_tx90l_on_rail(warm=True)
     robot = cold_robot.robot
@@ -118,9 +122,9 @@ def run_study(
     if motion is None:
         plan = _design(base, seed, progress)
         motion = plan.trajectory
-    progress("adding the leads", 0.0)
+    progress("adding the leads", 0.55)
     played_motion = jid.trajectories.with_leads(motion, robot, periods=periods)
-    progress("inverse kinematics of the verification path", 0.0)
+    progress("inverse kinematics of the verification path", 0.57)
     tip_path = jid.trajectories.iso9283_path(
         CENTRE, EDGE, TOOL, leans_along=1, speed=SPEED, acceleration=ACCELERATION
     )
@@ -133,11 +137,11 @@ def run_study(
     )
     observations = []
     for number, (virtual_robot, trajectory, name) in enumerate(runs, 10 * seed):
-        progress(f"measuring: {name}", 0.0)
+        progress(f"measuring: {name}", 0.6 + 0.06 * len(observations))
         observations.append(_measure(virtual_robot, trajectory, name, number))
     cold_log, warm_log, verification_log = observations
 
-    progress("identifying", 0.0)
+    progress("identifying", 0.78)
     rows = jid.RegressionProblem(base, [cold_log])
     truth = np.asarray(base.from_standard(cold_robot.parameters))
     weighted_fit = jid.identify(base, rows, jid.WeightedLeastSquares())
@@ -148,12 +152,12 @@ def run_study(
         "consistent": jid.identify(base, rows, jid.PhysicallyConsistent()),
         "true parameters": eqx.tree_at(lambda fit: fit.parameters, weighted_fit, truth),
     }
-    progress("predicting torques", 0.0)
+    progress("predicting torques", 0.83)
     models = [
         Model(name, fit, jid.validate(fit, [cold_log, verification_log]))
         for name, fit in fits.items()
     ]
-    progress("comparing cold and warm", 0.0)
+    progress("comparing cold and warm", 0.94)
     return Study(
         seed,
         base,
@@ -196,8 +200,9 @@ def _design(
     position_max[SHOULDER] = 0.4
     acceleration[SHOULDER] = 3.0
 
-    stage = "designing the motion"
-    progress(stage, 0.0)
+    def report(search: DesignProgress) -> None:
+        progress("designing the motion", 0.08 + 0.47 * search.fraction)
+
     shapes = jid.robots.tx90l_on_rail_collision()
     return jid.design_excitation(
         base,
@@ -214,6 +219,6 @@ def _design(
         generations=0,
         samples=SAMPLES,
         key=jax.random.key(seed),
-        progress=lambda search: progress(stage, search.fraction),
+        progress=report,
         throw=False,
     )

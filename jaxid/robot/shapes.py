@@ -240,7 +240,7 @@ def _dot(x: Vectors, y: Vectors):
     return products[..., :1] + products[..., 1:2] + products[..., 2:]
 
 
-def _fraction(numerator: Array, denominator: Array, usable: Array):
+def _fraction(numerator: AnyArray, denominator: AnyArray, usable: AnyArray):
     """Return a ratio clipped to the range from 0 to 1; zero where it is not usable."""
     divisor = jnp.where(usable, denominator, 1.0)
     ratio = jnp.clip(numerator / divisor, 0.0, 1.0)

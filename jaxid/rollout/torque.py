@@ -6,6 +6,7 @@ measured accelerations, it needs no second derivative, and errors that add up ov
 horizon count.
 """
 
+import contextlib
 import dataclasses
 import functools
 import itertools
@@ -360,16 +361,15 @@ def identify_torque_rollout(
         return errors[COUNTED_STEP - 1 :: COUNTED_STEP].ravel()
 
     search = search_squares(residuals, start, -limits, limits, args=windows, rtol=1e-5)
-    minimum = None
     with double_precision():
-        try:
-            for count, trial in enumerate(itertools.islice(search, MAX_STEPS), 1):
-                minimum = trial
+        minimum = next(search)
+        # From the second step on, a stop keeps the best so far.
+        with contextlib.suppress(KeyboardInterrupt):
+            steps = itertools.islice(search, MAX_STEPS - 1)
+            for count, step in enumerate(steps, 2):
+                minimum = step
                 if progress is not None:
                     progress("best so far of a search", count / MAX_STEPS)
-        except KeyboardInterrupt:
-            if minimum is None:
-                raise
     errors = np.asarray(minimum.residuals).reshape(-1, *windows.q.shape)
     blocks = windows.starts * BLOCKS // (windows.starts.max() + 1)
     uncertainty = _uncertainty(minimum, np.broadcast_to(blocks, errors.shape).ravel())
