@@ -149,6 +149,8 @@ def identify_rollout(
     fine_fit = _in_short_enough_steps(fit)
     if fine_fit is not fit:
         fit, hold_is_told = _with_better_commands(fine_fit)
+        # Errors of short steps are noise: estimates are worth the last rounds.
+        fit = _descend(fit, min_fall=MIN_FALL / 100)
     heavy_joints = choice.loaded_joints & (known_compliance > 0.0)
     return ServoFit.of(
         fit,
@@ -246,12 +248,14 @@ def _with_better_commands(fit: JointFit) -> tuple[JointFit, bool]:
     return rival if gain > 0.0 else fit, abs(gain) > MIN_FALL
 
 
-def _descend(fit: JointFit, rounds: int = MAX_ROUNDS) -> JointFit:
+def _descend(
+    fit: JointFit, rounds: int = MAX_ROUNDS, min_fall: float = MIN_FALL
+) -> JointFit:
     """Return the minimum, with loads and weights that follow the simulation."""
     for _ in range(rounds):
         previous_score = _score(fit)
         fit = fit.along_simulation().weighed_by_errors().improved(2)
-        if abs(previous_score - _score(fit)) < MIN_FALL:
+        if abs(previous_score - _score(fit)) < min_fall:
             break
     return fit
 

@@ -362,11 +362,11 @@ def identify_torque_rollout(
 
     search = search_squares(residuals, start, -limits, limits, args=windows, rtol=1e-5)
     with double_precision():
-        minimum = next(search)
-        # From the second step on, a stop keeps the best so far.
+        steps = itertools.islice(search, MAX_STEPS)
+        minimum = next(steps)
+        # From here on a stop keeps the best so far.
         with contextlib.suppress(KeyboardInterrupt):
-            steps = itertools.islice(search, MAX_STEPS - 1)
-            for count, step in enumerate(steps, 2):
+            for count, step in enumerate(itertools.chain([minimum], steps), 1):
                 minimum = step
                 if progress is not None:
                     progress("best so far of a search", count / MAX_STEPS)

@@ -138,5 +138,5 @@ def test_a_virtual_robot_follows_its_own_model_but_mujoco_is_refused(fit):
     expected = model.forward_dynamics(values, m.q[0], m.qd[0], still)
     step_accelerations = np.asarray(plant.read())[2 * robot.joints :]
     np.testing.assert_allclose(step_accelerations, expected, rtol=0.1, atol=0.5)
-    with pytest.raises(InputError, match="follows another one"):
+    with pytest.raises(InputError, match="follows another joint"):
         MujocoRobot(virtual).forces(m)

@@ -233,7 +233,7 @@ def test_what_cannot_have_memory_says_so():
     with pytest.raises(InputError, match="Presliding"):
         jid.identify_presliding(jid.base_parameters(model_of(Tanh())), log)
     terms = (CoulombFriction(Presliding(1e-3)), SquareRootFriction(Presliding(2e-3)))
-    with pytest.raises(InputError, match="same"):
+    with pytest.raises(InputError, match="must share one"):
         jid.Model(ROBOT, terms).memory  # noqa: B018
     with pytest.raises(InputError, match="positive"):
         Presliding(length=0.0)
