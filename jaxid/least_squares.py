@@ -14,6 +14,10 @@ Residuals = Callable[[Array, Any], Array]
 """Function of the unknowns and of other arguments that returns errors [rows]."""
 
 
+Bounds = tuple[AnyArray, AnyArray]
+"""Smallest and largest unknowns."""
+
+
 class Minimum(NamedTuple):
     """Unknowns for which the sum of squares is smallest.
 
@@ -67,19 +71,20 @@ def minimise_squares(
 
 
 def search_squares(
-    residuals: Residuals,
-    start: Float[AnyArray, " unknowns"],
-    lower: AnyArray | float = -jnp.inf,
-    upper: AnyArray | float = jnp.inf,
-    *,
-    args: Any = None,
-    rtol: float = 1e-8,
+    residuals: Residuals, start: AnyArray, bounds: Bounds, args: Any, rtol: float
 ) -> Iterator[Minimum]:
     """Yield the best unknowns after each step of a search that takes long.
 
-    Unlike `minimise_squares` it can show progress and be interrupted. The arguments are
-    the same.
+    Unlike `minimise_squares` it can show progress and be interrupted.
+
+    Args:
+        residuals: Differentiable function of the unknowns and of `args`.
+        start: Unknowns at which the search starts; brought within the bounds.
+        bounds: Smallest and largest unknowns.
+        args: Other arguments of `residuals`.
+        rtol: Relative decrease of the sum of squares below which the search ends.
     """
+    lower, upper = bounds
     solver = BoundedLevenbergMarquardt(rtol=rtol)
     options = {"lower": jnp.asarray(lower), "upper": jnp.asarray(upper)}
 

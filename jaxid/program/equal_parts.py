@@ -112,36 +112,17 @@ def find_equal_parts(program: Program, numbers: np.ndarray) -> Loops | None:
     except graphlib.CycleError:
         return None
     shared_nodes = _shared_nodes(program, names)
-    rows = _input_rows(program)
     values = [constants.get(x) if isinstance(x, int) else x for x in program.outputs]
     constant_results = sorted({x for x in values if x is not None})
     inputs = sum(math.prod(shape) for shape in program.input_shapes[1:])
+    rows = _input_rows(program)
     start = inputs + len(constant_results)
     loops = []
     for turns in groups:
         parts = [_part(program, positions, constants) for positions in turns]
-        results = _results(parts, shared_nodes)
-        size = max(map(len, results.values()))
-        sources = []
-        for turn, part in enumerate(parts):
-            if not all(x in rows for x in part.values):
-                return None
-            sources.append([rows[x] for x in part.values])
-            first_row = start + turn * size
-            for position, place in part.places.items():
-                if place in results[part.nodes]:
-                    rows[position] = first_row + results[part.nodes].index(place)
-        programs = [_program(nodes, places) for nodes, places in results.items()]
-        numbers_of_turns = [[constants[x] for x in part.numbers] for part in parts]
-        choices = [list(results).index(part.nodes) for part in parts]
-        loop = Loop(
-            tuple(programs),
-            np.array(choices, np.int32),
-            _filled_up(numbers_of_turns, float),
-            _filled_up(sources, np.int32),
-            start,
-            size,
-        )
+        loop = _loop(parts, shared_nodes, constants, rows, start)
+        if loop is None:
+            return None
         loops.append(loop)
         start = loop.stop
     entries = []
@@ -151,6 +132,42 @@ def find_equal_parts(program: Program, numbers: np.ndarray) -> Loops | None:
         else:
             entries.append(inputs + constant_results.index(value))
     return Loops(tuple(loops), np.array(constant_results), np.array(entries, np.int32))
+
+
+def _loop(
+    parts: Sequence[Part],
+    shared_nodes: set[int],
+    constants: Mapping[int, float],
+    rows: dict[int, int],
+    start: int,
+) -> Loop | None:
+    """Return parts as a loop, and add the rows of their results to those of all nodes.
+
+    None if a part needs a later one.
+    """
+    results = _results(parts, shared_nodes)
+    size = max(map(len, results.values()))
+    sources = []
+    for turn, part in enumerate(parts):
+        if not rows.keys() >= set(part.values):
+            return None
+        sources.append([rows[x] for x in part.values])
+        first_row = start + turn * size
+        places = results[part.nodes]
+        for position, place in part.places.items():
+            if place in places:
+                rows[position] = first_row + places.index(place)
+    programs = [_program(nodes, places) for nodes, places in results.items()]
+    choices = [list(results).index(part.nodes) for part in parts]
+    numbers = [[constants[x] for x in part.numbers] for part in parts]
+    return Loop(
+        tuple(programs),
+        np.array(choices, np.int32),
+        _filled_up(numbers, float),
+        _filled_up(sources, np.int32),
+        start,
+        size,
+    )
 
 
 def _constants(program: Program, numbers: np.ndarray):

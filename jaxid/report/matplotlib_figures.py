@@ -189,7 +189,8 @@ def _draw_path(figure: Figure, axes: Any, scene: Scene) -> None:
     else:
         path = Line3DCollection(steps, cmap="viridis", lw=1.4)
         path.set_array(scene.mean[:-1])
-        figure.colorbar(path, ax=axes, shrink=0.7, label=scene.label)
+        if scene.label:
+            figure.colorbar(path, ax=axes, shrink=0.7, label=scene.label)
     axes.add_collection3d(path, autolim=False)
 
 

@@ -169,7 +169,6 @@ def compared_poses(
         points=np.concatenate([first.points, second.points], axis=1),
         links=(*first.links, *second_links),
         values=np.tile(colours, (len(first.time), 1)),
-        label="0: measured, 1: simulated",
     )
     return Figure(title, height=2.6, width=7.5, scene=scene)
 

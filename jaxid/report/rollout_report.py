@@ -204,19 +204,19 @@ def _answer(robot: Robot, errors: RolloutErrors, units: Sequence[str]) -> Answer
     totals = 1e3 * errors.total()
     joint = int(np.argmax(totals))
     unit = units[joint]
-    place = f"at {errors.joint_names[joint]}"
+    name = errors.joint_names[joint]
     error = f"{significant(totals[joint])} {unit}"
-    sentence = f"The largest error of the simulation, {error} RMS, is {place}"
+    sentence = f"The largest error of the simulation, {error} RMS, is at joint `{name}`"
     if _is_good(errors).all():
         sentence = (
             "The simulation is closer to the robot than its baselines; the largest "
-            f"error, {error} RMS, is {place}"
+            f"error, {error} RMS, is at joint `{name}`"
         )
-    numbers = [(error, f"simulation, largest error, {place}")]
+    numbers = [(error, f"simulation, largest error, joint {name}")]
     for baseline in errors.baselines:
         value = significant(1e3 * errors.total(baseline)[joint])
         words = BASELINES[baseline].replace("\n", " ")
-        numbers.append((f"{value} {unit}", f"{words}, {place}"))
+        numbers.append((f"{value} {unit}", f"{words}, joint {name}"))
 
     # The motion with the largest error shows most.
     motion = int(np.argmax(errors.rms().max(axis=1)))
@@ -225,7 +225,10 @@ def _answer(robot: Robot, errors: RolloutErrors, units: Sequence[str]) -> Answer
         errors.time[motion],
         errors.measured[motion].T,
         errors.simulated[motion].T,
-        title=f"{errors.motions[motion]}: measured and simulated robot",
+        title=(
+            f"{errors.motions[motion]}: measured and simulated robot (on screen blue "
+            "and orange)"
+        ),
     )
     motions = range(min(MAX_FIGURES, len(errors.motions)))
     figures = [scene, *(motion_figure(errors, k, units) for k in motions)]

@@ -261,8 +261,8 @@ class ServoFit(Summarised):
             facts.append(("contacts given", text))
         is_clear = [c.is_determined and c.agrees for c in rows]
         remarks: list[Remark | str] = [
-            "positions determine inertias, friction, load and motor gain only in their "
-            "ratios to the stiffness",
+            "Positions determine inertias, friction, load and motor gain only in their "
+            "ratios to the stiffness.",
             *(Remark(note, Status.DOUBTFUL) for note in self.notes),
         ]
         return Table(

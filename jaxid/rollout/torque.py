@@ -360,7 +360,7 @@ def identify_torque_rollout(
         errors = rollout.errors(unknowns, windows)
         return errors[COUNTED_STEP - 1 :: COUNTED_STEP].ravel()
 
-    search = search_squares(residuals, start, -limits, limits, args=windows, rtol=1e-5)
+    search = search_squares(residuals, start, (-limits, limits), windows, 1e-5)
     with double_precision():
         steps = itertools.islice(search, MAX_STEPS)
         minimum = next(steps)

@@ -122,7 +122,7 @@
     const title = { text: escaped(label), side: "top" };
     const colorbar = { title, thickness: 10, orientation: "h", len: 0.6, y: 0, yanchor: "bottom" };
     const trace = { type: "scatter3d", hoverinfo: "skip", showlegend: false };
-    const line = { color: mean, width: 4, showscale: largest !== null, colorbar, ...scale };
+    const line = { color: mean, width: 4, showscale: label !== "", colorbar, ...scale };
     const marker = { size: 5, color: pale, line: { color: grey, width: 2 } };
     const traces = [
       { ...trace, mode: "lines", ...path, line },
