@@ -378,11 +378,15 @@ def servo_positions(sent: np.ndarray, effects: dict[str, float]) -> np.ndarray:
         command = sent[sample]
         rate = np.zeros(axes)
         if feed > 0.0 and k >= delay_steps:
-            command = command + rest / stride * changes[sample]
+            # Its mean over the step, as that of a held command.
+            command = command + (rest + 0.5) / stride * changes[sample]
             rate = changes[sample] / 0.02
         error = command - data.qpos
+        # Half of the step's growth before the force, half behind it: the mean.
+        half_growth = 0.5 * SERVO_STEP * integral_gain * error
+        integral += half_growth
         drive_force = np.clip(error + integral + feed * rate, -largest, largest)
-        integral += SERVO_STEP * integral_gain * error
+        integral += half_growth
         if load_friction > 0.0:
             mujoco.mj_mulM(model, data, product, data.qacc)
             mujoco.mj_fullM(model, data, M)
