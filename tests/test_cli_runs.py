@@ -25,8 +25,8 @@ from test_cli import (  # noqa: F401
 )
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.experiment.experiment import load_experiment
+from jaxid.program.sample_methods import in_numpy
 from jaxid.simulation.virtual import random_bodies
 from jaxid.workflow.log_loading import read_log
 

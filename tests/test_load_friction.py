@@ -5,9 +5,9 @@ import pytest
 from arm_files import HALF_PI, urdf_of_arm
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.experiment.experiment import load_experiment
 from jaxid.identification.problem import RegressionProblem
+from jaxid.program.sample_methods import in_numpy
 
 ARM_FILE = urdf_of_arm(
     (0.0, 0.0, 0.3, 0.0), (0.1, 0.0, 0.0, -HALF_PI), (0.4, 0.0, 0.1, 0.0)

@@ -22,6 +22,7 @@ from jaxid.arrays import (
 )
 from jaxid.errors import InputError
 from jaxid.program import Program, Shape, select_outputs
+from jaxid.program.sample_methods import in_numpy, on_samples, program_of
 from jaxid.result_table import MISSING, Column, Remark, Status, Summarised, Table
 
 from .base_parameter_expressions import Summand, write_expression
@@ -36,7 +37,6 @@ from .rank import (
     rank_by_singular_values,
     regrouping,
 )
-from .sample_methods import in_numpy, on_samples, program_of
 
 Parameters = Float[AnyArray, " base"] | Sequence[float | int]
 

@@ -22,12 +22,12 @@ from jaxid.arrays import (
 )
 from jaxid.errors import InputError
 from jaxid.program import Shape
+from jaxid.program.sample_methods import on_samples, spatial_form
 from jaxid.robot.robot import Robot
 
 from . import projection_equation
 from .motion import Motion, as_motion, as_state
 from .packed_regressor import PackedRegressor, gram
-from .sample_methods import on_samples, spatial_form
 from .terms import (
     AbstractTerm,
     CoulombFriction,

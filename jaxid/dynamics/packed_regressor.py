@@ -23,9 +23,8 @@ from jaxid.program import (
     on_any_platform,
     packed_entries,
 )
+from jaxid.program.sample_methods import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
 from jaxid.program.xla_sample_blocks import distinct_rows, row_products
-
-from .sample_methods import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
 
 Columns = tuple[int, ...]
 """Positions of columns, in order."""

@@ -14,12 +14,12 @@ import numpy as np
 import scipy
 
 from jaxid.arrays import AnyArray, Float
+from jaxid.program.sample_methods import in_numpy
 from jaxid.units.dimensions import length_power
 
 from .model import Model
 from .motion import Motion
 from .packed_regressor import Columns
-from .sample_methods import in_numpy
 
 ROUNDING = 1e-12
 """Fraction of the largest column below which a column is nothing but rounding."""

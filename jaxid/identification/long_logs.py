@@ -29,10 +29,10 @@ from jaxid.arrays import (
     on_cores,
 )
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.sample_methods import program_of
 from jaxid.measurement.filters import AbstractLowPass
 from jaxid.measurement.observations import Observations, Progress
 from jaxid.program import Program, lower
+from jaxid.program.sample_methods import program_of
 
 from .factors import Factors, JointFactor, divide_rows, row_chunks, without_tool
 

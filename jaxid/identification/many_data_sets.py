@@ -25,9 +25,9 @@ from jaxid.arrays import (
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import JointRegressor
-from jaxid.dynamics.sample_methods import opened
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
+from jaxid.program.sample_methods import opened
 from jaxid.robot.robot import Robot
 
 from .batch_solution import BatchFit, DataSets, solve

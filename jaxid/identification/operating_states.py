@@ -8,8 +8,8 @@ import scipy
 
 from jaxid.arrays import AnyArray, Float, Indices, Matrix, Texts
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.errors import InputError
+from jaxid.program.sample_methods import in_numpy
 from jaxid.result_table import Summarised, Table
 
 from .combination import as_least_squares, combine, replace_estimates, require_same_base

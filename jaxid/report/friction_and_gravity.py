@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.fit_result import Fit
+from jaxid.program.sample_methods import in_numpy
 from jaxid.result_table import Column, Table, percent, significant
 from jaxid.robot.collision_geometry import BodyShape
 from jaxid.validation.torque_errors import TorqueErrors

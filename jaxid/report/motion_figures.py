@@ -11,7 +11,7 @@ import scipy
 
 from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.sample_methods import in_numpy
+from jaxid.program.sample_methods import in_numpy
 from jaxid.robot.collision import GROUND, Box, CollisionModel, HalfSpace
 from jaxid.robot.collision_geometry import Shape
 from jaxid.robot.forward_kinematics import placements, tip_placement

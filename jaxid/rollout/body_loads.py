@@ -7,7 +7,7 @@ import scipy
 
 from jaxid.arrays import AnyArray
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.sample_methods import in_numpy
+from jaxid.program.sample_methods import in_numpy
 
 CUTOFF = 8.0
 """Frequency below which measured positions tell accelerations [Hz]."""

@@ -20,7 +20,6 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Vector, double_precision
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.sample_methods import program_of
 from jaxid.dynamics.terms import HardSign
 from jaxid.errors import InputError
 from jaxid.identification.identify import identify
@@ -28,6 +27,7 @@ from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.blocks import block_covariance
 from jaxid.least_squares import Minimum, search_squares
 from jaxid.measurement.observations import Observations
+from jaxid.program.sample_methods import program_of
 from jaxid.program.xla import lower
 from jaxid.result_table import Column, Summarised, Table, estimate_columns
 

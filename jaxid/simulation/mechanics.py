@@ -14,9 +14,9 @@ from jaxid.dynamics.projection_equation import (
     rigid_body_mass_matrix,
     solve_symmetric,
 )
-from jaxid.dynamics.sample_methods import program_of
 from jaxid.errors import InputError
 from jaxid.program import to_python
+from jaxid.program.sample_methods import program_of
 
 from .friction_and_ripple import AbstractGearFriction, TorqueRipple
 

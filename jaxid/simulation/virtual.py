@@ -12,11 +12,11 @@ import scipy
 from jaxid.arrays import AnyArray, Float, Hashable, Joints, require_float64
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import inertial_parameters
 from jaxid.measurement.recording import Recording
+from jaxid.program.sample_methods import in_numpy
 from jaxid.robot.inertia import BodyParameters
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.trajectory import AbstractTrajectory

@@ -10,7 +10,7 @@ import scipy
 from jaxid.arrays import Matrix3
 from jaxid.dynamics import projection_equation
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.sample_methods import in_numpy
+from jaxid.program.sample_methods import in_numpy
 from jaxid.robot.robot import Robot
 
 from .filtered_log import GRID_RATE, FilteredLog, Motion

@@ -8,12 +8,12 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Joints, JointSamples, Matrix, Texts, Vector
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.estimators import ResidualVariances, WeightedLeastSquares
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.problem import RegressionProblem
 from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, ObservedLogs, Progress
+from jaxid.program.sample_methods import in_numpy
 from jaxid.result_table import (
     Column,
     Remark,

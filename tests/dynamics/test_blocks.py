@@ -7,9 +7,9 @@ import pytest
 from trees import random_tree
 
 import jaxid as jid
-from jaxid.dynamics import sample_methods
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.sample_methods import in_numpy, program_of, spatial_form
+from jaxid.program import sample_methods
+from jaxid.program.sample_methods import in_numpy, program_of, spatial_form
 
 MODEL = jid.Model(jid.robots.planar_arm())
 P = np.random.default_rng(0).uniform(0.5, 1.0, MODEL.size)

@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import program_of
 from jaxid.program import evaluate, trace
+from jaxid.program.sample_methods import program_of
 
 
 @pytest.mark.parametrize("name", ["panda", "tx90l_on_rail"])

@@ -7,7 +7,6 @@ import trees
 from jaxid.dynamics.base import base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.sample_methods import on_samples
 from jaxid.dynamics.terms import (
     CoulombFriction,
     CoupledDrives,
@@ -19,6 +18,7 @@ from jaxid.dynamics.terms import (
     ViscousFriction,
 )
 from jaxid.errors import InputError
+from jaxid.program.sample_methods import on_samples
 from jaxid.robot import library as robots
 from jaxid.robot.limits_and_drives import Drives
 

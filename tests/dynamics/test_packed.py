@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import MAX_SAMPLES_IN_NUMPY
+from jaxid.program.sample_methods import MAX_SAMPLES_IN_NUMPY
 
 TERMS = (
     jid.RigidBodies(),

@@ -12,9 +12,9 @@ from compiled_model import CompiledModel
 from export_samples import fit_of, motion, possible
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.errors import InputError
 from jaxid.export import exported_function, torque_program
+from jaxid.program.sample_methods import in_numpy
 
 pytestmark = pytest.mark.skipif(
     shutil.which("gcc") is None, reason="no C compiler (gcc)"

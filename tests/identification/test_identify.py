@@ -5,7 +5,7 @@ import pytest
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import in_numpy
+from jaxid.program.sample_methods import in_numpy
 from jaxid.result_table import Status
 
 PLAIN = jid.estimators.LeastSquares()

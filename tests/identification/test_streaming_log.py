@@ -6,11 +6,11 @@ import pytest
 from virtual import motion, standard_parameters
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification import long_logs
 from jaxid.measurement.log_files import text_files
 from jaxid.measurement.reading import scan_log
 from jaxid.measurement.time_grid import NeedsMemory
+from jaxid.program.sample_methods import in_numpy
 
 COLUMNS = jid.Columns(angles="q{}", forces="tau{}", time="t")
 SAMPLES = 20000

@@ -14,13 +14,13 @@ from virtual import (
 )
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.uncertainty import UNCERTAINTIES, spectra_of_rows
 from jaxid.identification.uncertainty.spectral import (
     SpectralTable,
     sandwich,
     white_variances,
 )
+from jaxid.program.sample_methods import in_numpy
 
 ESTIMATOR = jid.WeightedLeastSquares(jid.estimators.ResidualVariances(0))
 

@@ -5,10 +5,10 @@ import math
 import numpy as np
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.factors import Blocks
 from jaxid.identification.fit_result import ConditionNumbers
 from jaxid.identification.uncertainty import Uncertainty
+from jaxid.program.sample_methods import in_numpy
 
 
 def standard_parameters(model: jid.Model, seed: int = 0) -> np.ndarray:

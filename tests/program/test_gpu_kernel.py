@@ -11,9 +11,9 @@ from jax.sharding import Mesh, NamedSharding, PartitionSpec
 from sample_functions import every_operation
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import in_numpy, program_of
 from jaxid.program import gpu_kernel, trace, xla_sample_blocks
 from jaxid.program.gpu_kernel import BLOCK, in_kernel
+from jaxid.program.sample_methods import in_numpy, program_of
 
 ARM = jid.Model(jid.robots.planar_arm())
 PANDA = jid.Model(jid.robots.panda())

@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Int
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.sample_methods import in_numpy, on_samples, program_of
 from jaxid.program.gradient import pull_back
+from jaxid.program.sample_methods import in_numpy, on_samples, program_of
 from jaxid.robot.robot import Robot
 
 Excess = Float[AnyArray, "*batch values"]

@@ -10,8 +10,8 @@ import numpy as np
 
 from jaxid.arrays import Vector3, as_array
 from jaxid.dynamics.motion import Motion
-from jaxid.dynamics.sample_methods import on_samples
 from jaxid.errors import InputError
+from jaxid.program.sample_methods import on_samples
 from jaxid.robot.forward_kinematics import tip_placement
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import Vectors

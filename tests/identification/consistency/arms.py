@@ -3,8 +3,8 @@
 import numpy as np
 
 import jaxid as jid
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.identification.consistency.scaled_rows import ScaledRows, scaled_rows
+from jaxid.program.sample_methods import in_numpy
 from jaxid.simulation.virtual import random_bodies
 
 TERMS = (

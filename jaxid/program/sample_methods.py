@@ -29,10 +29,13 @@ from jaxid.arrays import (
     is_traced,
 )
 from jaxid.errors import InputError
-from jaxid.program import Program, Shape, evaluate, trace
-from jaxid.program.equal_parts import find_equal_parts
-from jaxid.program.jax_transformation_rules import with_derivatives_of
-from jaxid.program.xla_sample_blocks import BLOCK, on_rows
+
+from .equal_parts import find_equal_parts
+from .jax_transformation_rules import with_derivatives_of
+from .numpy_evaluation import evaluate
+from .program import Program, Shape
+from .trace import trace
+from .xla_sample_blocks import BLOCK, on_rows
 
 
 class OpenModel(eqx.Module):
