@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import numpy as np
 
 from jaxid.arrays import AnyArray, Float, ManyJoints, as_array
 from jaxid.errors import InputError
@@ -39,6 +40,37 @@ class Motion(eqx.Module):
     def joints(self) -> int:
         """Number of joints."""
         return self.q.shape[-1]
+
+
+def floating_motion(
+    q: Any,
+    qd: Any,
+    qdd: Any,
+    accelerations: Any,
+    rates: Any,
+    angular_accelerations: Any,
+) -> Motion:
+    """Return the motion of a robot with a floating base, along the axes of its base.
+
+    Args:
+        q: Coordinates of the driven joints [rad or m].
+        qd: Their velocities [rad/s or m/s].
+        qdd: Their accelerations [rad/s² or m/s²].
+        accelerations: Acceleration of the base's origin less gravity, which an
+            accelerometer measures there [m/s²].
+        rates: Angular velocity of the base, which a gyroscope measures [rad/s].
+        angular_accelerations: Its derivative [rad/s²].
+    """
+    x, y, z = np.moveaxis(np.asarray(rates), -1, 0)
+    # Three joints in a row turn the base: the first ones turn the axes of the others.
+    turned_rates = np.stack([y * z, -x * z, x * y], axis=-1)
+    at_rest = np.zeros_like(accelerations)
+    base_accelerations = [accelerations, angular_accelerations - turned_rates]
+    return Motion(
+        np.concatenate([at_rest, at_rest, q], axis=-1),
+        np.concatenate([at_rest, rates, qd], axis=-1),
+        np.concatenate([*base_accelerations, qdd], axis=-1),
+    )
 
 
 def as_motion(*motion: Any) -> Motion:

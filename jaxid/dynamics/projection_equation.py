@@ -49,6 +49,9 @@ def body_motions(
             a = R.T @ (a + accelerations @ r)
             w_parent = R.T @ w
             wd_parent = R.T @ wd
+            if i in robot.rigid:
+                motions[i] = (a, w_parent, wd_parent)
+                continue
             # ... and the joint moves it relative to the parent.
             rate = axis * qdd[i]
             turned_rate = jnp.cross(w_parent, axis) * qd[i]

@@ -104,6 +104,8 @@ def _relative_placements(robot: Robot, q: Joints):
     is_turning = jnp.asarray(is_revolute, dtype)
     slides = jnp.asarray(~is_revolute, dtype)
     angle = all_coordinates(robot.followers, q)[:, None, None]
+    if robot.virtual:
+        angle = angle * _zeros_at(robot.virtual, robot, dtype)[:, None, None]
 
     # Rodrigues: I + sin(q) [axis] + (1 - cos(q)) [axis]^2, if the joint turns.
     identity = jnp.eye(3, dtype=dtype)[None]
@@ -119,6 +121,13 @@ def _relative_placements(robot: Robot, q: Joints):
     last_column = ((0, 0), (0, 0), (3, 0))
     translation = jnp.pad(offset[:, :, None], last_column)
     return rotation @ motion + translation
+
+
+def _zeros_at(joints: tuple[int, ...], robot: Robot, dtype: Any):
+    """Return zero for some joints and one for all others."""
+    factors = np.ones(robot.bodies)
+    factors[list(joints)] = 0.0
+    return jnp.asarray(factors, dtype)
 
 
 class GroundMotion(NamedTuple):
@@ -150,6 +159,10 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     joints = jnp.concatenate([angular_velocities, linear_velocities], axis=1)
 
     is_moved = jnp.asarray(moved_by(robot), dtype)
+    if robot.rigid:
+        joints_at_rest = _zeros_at(robot.rigid, robot, dtype)[: robot.joints]
+        qd = qd * joints_at_rest
+        qdd = qdd * joints_at_rest
     speeds = joints * all_rates(robot.followers, qd)[:, None]
     # Sums over all joints that move a body replace the recursion along the tree.
     v = is_moved @ speeds

@@ -13,8 +13,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Float, PRNGKeyArray, namespace
 from jaxid.errors import InputError
-from jaxid.robot.limits_and_drives import Limits
-from jaxid.robot.robot import Robot, complete_limits
+from jaxid.robot.limits_and_drives import Limits, complete_limits
+from jaxid.robot.robot import Robot
 from jaxid.trajectory.trajectory import AbstractBasis, Coefficients
 
 ScaledMotion = Float[AnyArray, " scaled"]

@@ -32,9 +32,13 @@ def in_words(name: str, model: Model) -> tuple[str, str]:
 
 def _joint(robot: Robot, number: str) -> str:
     """Return a joint by its number; nothing if the robot has no such joint."""
-    if not number or not 0 < int(number) <= robot.bodies:
+    if not number or int(number) not in robot.numbers:
         return ""
-    name = robot.body_names[int(number) - 1]
+    # All bodies of a group of virtual joints have one number; the last one has a mass.
+    body = max(i for i, x in enumerate(robot.numbers) if x == int(number))
+    if body in robot.virtual:
+        return robot.body_names[body]
+    name = robot.body_names[body]
     return name if name.lower().startswith("joint") else f"joint {name}"
 
 

@@ -13,7 +13,8 @@ from jaxid.arrays import AnyArray, Array, Float, Hashable, Joints, double_precis
 from jaxid.errors import InputError
 
 from .forward_kinematics import placements
-from .robot import Robot, complete_limits
+from .limits_and_drives import complete_limits
+from .robot import Robot
 from .shapes import GROUND, Box, Capsule, HalfSpace, segment_distance
 
 POSES = 400

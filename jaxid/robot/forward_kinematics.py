@@ -26,6 +26,8 @@ def placement_in_parent(
     R = robot.rotation[body]
     r = robot.offset[body]
     axis = robot.axis[body]
+    if body in robot.virtual:
+        return R, r
     if robot.turns[body]:
         return R @ rotation_about(axis, q), r
     return R, r + R @ axis * q

@@ -17,7 +17,8 @@ from jaxid.arrays import Joints, Matrix3, Numbers, as_array
 from jaxid.errors import InputError
 
 from .forward_kinematics import TipJacobian, tip_curvature, tip_jacobian
-from .robot import Robot, as_rotations, complete_limits
+from .limits_and_drives import complete_limits
+from .robot import Robot, as_rotations
 
 POSE_TOLERANCE = 1e-9
 """Distance at which a pose is reached [m, and rad]."""

@@ -276,6 +276,35 @@ def _require_ranges(low: np.ndarray, high: np.ndarray):
         )
 
 
+def complete_limits(robot: Any) -> Limits:
+    """Return the limits of a robot, with assumed ones for those that are unknown.
+
+    Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the
+    acceleration that reaches the largest speed in 0.25 s.
+    """
+    limits = robot.limits
+    is_revolute = np.array(robot.revolute, bool)
+    half_range = np.where(is_revolute, np.pi, 1.0)
+    speed = np.where(is_revolute, np.pi / 2, 0.5)
+    low = np.asarray(limits.position_min)
+    high = np.asarray(limits.position_max)
+    has_low = np.isfinite(low)
+    has_high = np.isfinite(high)
+
+    # A range that is open on one side is as long as one that is open on both.
+    assumed_low = np.where(has_high, high - 2 * half_range, -half_range)
+    assumed_high = np.where(has_low, low + 2 * half_range, half_range)
+    velocity = np.where(np.isfinite(limits.velocity), limits.velocity, speed)
+    has_acceleration = np.isfinite(limits.acceleration)
+    return dataclasses.replace(
+        limits,
+        position_min=np.where(has_low, low, assumed_low),
+        position_max=np.where(has_high, high, assumed_high),
+        velocity=velocity,
+        acceleration=np.where(has_acceleration, limits.acceleration, velocity / 0.25),
+    )
+
+
 def range_fault(low: float, high: float, revolute: bool) -> str:
     """Return a predicate that says why no joint has such a range; or ""."""
     max_end = MAX_STATED_ANGLE if revolute else MAX_STATED_LENGTH

@@ -25,6 +25,7 @@ from .follower_joints import Followers, order_from_ground
 from .inertia import IMPOSSIBLE, Inertia
 from .limits_and_drives import MAX_LENGTH, Drives, Limits, length_notes, limit_notes
 from .rotations import SNAP_TOLERANCE, snapped, snapped_rotations
+from .virtual_joints import GROUP, numbers_of_bodies
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -111,6 +112,9 @@ class Robot(Summarised, eqx.Module):
         source_base: Link on the ground that was asked for in that file, or None.
         source_arguments: Names and texts of the arguments of that file, if it is xacro.
         notes: Changes and assumptions that were made, one sentence each.
+        virtual: Indices of joints that nothing drives, in groups of six for the forces
+            between two bodies; coordinates are zero (`virtual_joints`).
+        floating: Whether the first group carries a base that moves.
 
     Raises:
         InputError: If shapes do not fit, a parent comes after its child, an axis is
@@ -140,6 +144,8 @@ class Robot(Summarised, eqx.Module):
     source_base: str | None = eqx.field(static=True, default=None)
     source_arguments: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
     notes: tuple[str, ...] = eqx.field(static=True, default=())
+    virtual: tuple[int, ...] = eqx.field(static=True, default=())
+    floating: bool = eqx.field(static=True, default=False)
 
     def __post_init__(self):
         if not self.revolute:
@@ -244,8 +250,7 @@ class Robot(Summarised, eqx.Module):
             # Arrays of JAX may be traced: their numbers are then unknown.
             if not isinstance(offset, np.ndarray):
                 continue
-            length = np.abs(offset).max()
-            if length > MAX_LENGTH:
+            if (length := np.abs(offset).max()) > MAX_LENGTH:
                 raise InputError(f"{owner} is {length:g} m long: give it in metres.")
             notes += length_notes(owner, offset)
         return notes
@@ -261,14 +266,38 @@ class Robot(Summarised, eqx.Module):
         return len(self.revolute) + len(self.followers)
 
     @property
+    def driven(self) -> tuple[int, ...]:
+        """Indices of the joints that are not virtual."""
+        return tuple(i for i in range(self.joints) if i not in self.virtual)
+
+    @property
+    def rigid(self) -> tuple[int, ...]:
+        """Indices of the virtual joints without velocity and acceleration."""
+        return self.virtual[GROUP:] if self.floating else self.virtual
+
+    @property
+    def solid_bodies(self) -> tuple[int, ...]:
+        """Indices of the bodies that have a mass."""
+        massless = {*self.virtual} - {*self.virtual[GROUP - 1 :: GROUP]}
+        return tuple(i for i in range(self.bodies) if i not in massless)
+
+    @property
+    def numbers(self) -> tuple[int, ...]:
+        """For each body the number in names of parameters."""
+        return numbers_of_bodies(self.bodies, self.virtual)
+
+    @property
     def turns(self) -> tuple[bool, ...]:
         """For each body whether its joint turns."""
         return (*self.revolute, *(f.revolute for f in self.followers))
 
     @property
     def body_names(self) -> tuple[str, ...]:
-        """Names of the joints that move the bodies."""
-        return (*self.joint_names, *(f.name for f in self.followers))
+        """Names of the joints that move the bodies, or of these bodies."""
+        names = [*self.joint_names, *(f.name for f in self.followers)]
+        for last in self.virtual[GROUP - 1 :: GROUP]:
+            names[last] = names[last].rpartition(" ")[0]
+        return tuple(names)
 
     @property
     def order(self) -> tuple[int, ...]:
@@ -442,35 +471,6 @@ class Robot(Summarised, eqx.Module):
             facts=facts,
             remarks=self.remarks,
         )
-
-
-def complete_limits(robot: Robot) -> Limits:
-    """Return the limits of a robot, with assumed ones for those that are unknown.
-
-    Assumed are: half a turn or 1 m to either side; 90 degrees/s or 0.5 m/s; the
-    acceleration that reaches the largest speed in 0.25 s.
-    """
-    limits = robot.limits
-    is_revolute = np.array(robot.revolute, bool)
-    half_range = np.where(is_revolute, np.pi, 1.0)
-    speed = np.where(is_revolute, np.pi / 2, 0.5)
-    low = np.asarray(limits.position_min)
-    high = np.asarray(limits.position_max)
-    has_low = np.isfinite(low)
-    has_high = np.isfinite(high)
-
-    # A range that is open on one side is as long as one that is open on both.
-    assumed_low = np.where(has_high, high - 2 * half_range, -half_range)
-    assumed_high = np.where(has_low, low + 2 * half_range, half_range)
-    velocity = np.where(np.isfinite(limits.velocity), limits.velocity, speed)
-    has_acceleration = np.isfinite(limits.acceleration)
-    return dataclasses.replace(
-        limits,
-        position_min=np.where(has_low, low, assumed_low),
-        position_max=np.where(has_high, high, assumed_high),
-        velocity=velocity,
-        acceleration=np.where(has_acceleration, limits.acceleration, velocity / 0.25),
-    )
 
 
 def _unit_axes(axes: AnyArray):

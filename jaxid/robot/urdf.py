@@ -22,6 +22,7 @@ from .limits_and_drives import (
 from .robot import Robot
 from .urdf_elements import ORIGIN
 from .urdf_tree import TURNING_TYPES, UrdfTree
+from .virtual_joints import GROUP
 
 MIN_RANGE = 1e-6
 """Length of a range below which it is empty, up to rounding [rad or m]."""
@@ -40,6 +41,7 @@ def load_urdf(
     base_rotation: Numbers | None = None,
     base_position: Numbers = ORIGIN,
     xacro_arguments: Mapping[str, str] | None = None,
+    floating: bool = False,
 ) -> Robot:
     """Load a robot from a URDF, xacro or MJCF file, without its inertias.
 
@@ -73,6 +75,9 @@ def load_urdf(
             and the base give it.
         base_position: Origin of the base link on the ground [m].
         xacro_arguments: Texts of the arguments of a xacro file, by name.
+        floating: Whether the base moves freely: it is a body on six virtual joints,
+            whose acceleration, gravity included, an IMU measures. `base` is then the
+            link of the base: the root if None, or the link that the file lets float.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -80,7 +85,9 @@ def load_urdf(
             or a link of the arm on a joint that mimics another, or angles or lengths in
             other units; if `xacro` or MuJoCo cannot read it or is missing.
     """
-    tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
+    tree = UrdfTree(
+        path, base=base, tip=tip, xacro_arguments=xacro_arguments, floating=floating
+    )
     limits, limit_notes = _limits(tree)
     notes = (
         *_held_notes(tree),
@@ -90,6 +97,8 @@ def load_urdf(
         *_negative_notes(tree),
         *_inertial_notes(tree),
     )
+    if floating:
+        gravity = np.zeros(3)
     if gravity is None:
         # An attitude of the base that the user gives is that on level ground.
         gravity = tree.gravity
@@ -119,6 +128,8 @@ def load_urdf(
             source_base=base,
             source_arguments=tuple((xacro_arguments or {}).items()),
             notes=notes,
+            virtual=tuple(range(GROUP)) if floating else (),
+            floating=floating,
         )
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
@@ -135,6 +146,7 @@ def urdf_parameters(
     tip: str | None = None,
     base: str | None = None,
     xacro_arguments: Mapping[str, str] | None = None,
+    floating: bool = False,
     check: bool = True,
 ) -> AnyArray:
     """Return the inertial parameters that a URDF or MJCF file claims (Eq. 9).
@@ -149,6 +161,7 @@ def urdf_parameters(
         tip: As in `load_urdf`.
         base: As in `load_urdf`.
         xacro_arguments: As in `load_urdf`.
+        floating: As in `load_urdf`; the first ten are then those of the base.
         check: Whether links that cannot exist are rejected; otherwise their numbers are
             returned as they are.
 
@@ -157,7 +170,9 @@ def urdf_parameters(
         InputError: If the file cannot be loaded, an inertia is not finite, or a link
             cannot exist.
     """
-    tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
+    tree = UrdfTree(
+        path, base=base, tip=tip, xacro_arguments=xacro_arguments, floating=floating
+    )
     return tree.bodies(check=check).ravel()
 
 
@@ -167,6 +182,7 @@ def joint_parameters(
     tip: str | None = None,
     base: str | None = None,
     xacro_arguments: Mapping[str, str] | None = None,
+    floating: bool = False,
 ) -> dict[str, Joints]:
     """Return `armature`, `damping`, dry `friction` and springs that a file claims.
 
@@ -174,10 +190,13 @@ def joint_parameters(
     or m]. All are zero where the file claims none. Those of joints that follow others
     count at the joints that they follow. Arguments and errors are those of `load_urdf`.
     """
-    tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
+    tree = UrdfTree(
+        path, base=base, tip=tip, xacro_arguments=xacro_arguments, floating=floating
+    )
     parameters = {}
+    joints = tree.joints[GROUP if floating else 0 :]
     for key in ("armature", "damping", "friction", "stiffness", "springref"):
-        elements = [joint.find("dynamics") for joint in tree.joints]
+        elements = [joint.find("dynamics") for joint in joints]
         values = [tree.numbers(element, key, (0.0,))[0] for element in elements]
         parameters[key] = np.array(values)
     if tree.followers:
@@ -411,6 +430,8 @@ def _inertial_notes(tree: UrdfTree):
             "the nearest moments that a real body can have."
         )
     light_bodies = [tree.joints[i].get("name") for i in np.flatnonzero(masses == 0.0)]
+    # Those of virtual joints have none.
+    light_bodies = light_bodies[GROUP - 1 if tree.floating else 0 :]
     if light_bodies:
         notes.append(
             f"{owners('joint', light_bodies)}: "
@@ -425,10 +446,12 @@ def _inertial_notes(tree: UrdfTree):
             if IMPOSSIBLE not in fault:
                 use = f"it {IMPOSSIBLE}, so the inertias of the file are not used"
             notes.append(f"link `{link}`: {fault}; {use}: correct its inertial.")
-    densities = ball_densities(tree.bodies())
+    bodies = tree.bodies()
+    densities = ball_densities(bodies)
+    joints = tree.joints[-len(bodies) :]
     dense_bodies = np.flatnonzero(densities > MAX_DENSITY)
     if dense_bodies.size and not any(faults.values()):
-        names = owners("joint", [tree.joints[i].get("name") for i in dense_bodies])
+        names = owners("joint", [joints[i].get("name") for i in dense_bodies])
         notes.append(
             f"{names}: mass and moments of the body {IMPOSSIBLE}: "
             f"{densities[dense_bodies[0]]:.2g} kg/m³ are more than the density of any "

@@ -1,5 +1,6 @@
 """Links and joints of URDF, xacro and MJCF files, merged into the bodies of a robot."""
 
+import copy
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -17,6 +18,7 @@ from .limits_and_drives import MAX_LINK_LENGTH, are_degrees, listed
 from .mjcf import Loop
 from .rotations import Placement, axis_rotation, without_rounding
 from .urdf_elements import ORIGIN, UrdfElements
+from .virtual_joints import GROUP, virtual_elements
 
 TURNING_TYPES = ("revolute", "continuous")
 """Types of joints that turn."""
@@ -51,6 +53,7 @@ class UrdfTree(UrdfElements):
         effects: Effects on forces of bodies that the default model leaves out.
         objects: Names of links that float and move no joint, which are left out.
         tip: Name of the end-effector's link.
+        floating: Whether the base is on virtual joints.
         compiled: Whether the file is MJCF, whose shapes are no elements of the links.
     """
 
@@ -61,8 +64,10 @@ class UrdfTree(UrdfElements):
         base: str | None = None,
         tip: str | None = None,
         xacro_arguments: Mapping[str, str] | None = None,
+        floating: bool = False,
     ) -> None:
         self.path = str(path)
+        self.floating = floating
         description = read_description(path, xacro_arguments)
         self.root, self.gravity, loops, effects = description
         self.compiled = is_mjcf(path)
@@ -73,18 +78,16 @@ class UrdfTree(UrdfElements):
         if self.root.find("joint/parent[@link='world']") is not None:
             # Simulators know this link, so that many files do not define it.
             self.links.setdefault("world", etree.Element("link", name="world"))
+        if floating:
+            base = self._float(base)
         self._below: dict[str, list[Any]] = {link: [] for link in self.links}
         self._above: dict[str, Any] = {}
         for joint in self.named_joints.values():
             self._add(joint)
 
         root = self._find_root()
-        for argument, link in (("base", base), ("tip", tip)):
-            if link is not None and link not in self.links:
-                raise InputError(
-                    f"`{argument}` must be a link of `{self.path}`, but is `{link}`; "
-                    f"its links are {listed(list(self.links))}."
-                )
+        self._require_link("base", base)
+        self._require_link("tip", tip)
         self.followers: Followers = ()
         self.base_gravity = np.array(self.gravity, np.float64)
         self.tilting_joints = []
@@ -100,6 +103,36 @@ class UrdfTree(UrdfElements):
         self._refuse_loops(loops)
         links = ("", *self.moving_links)
         self.effects = [effect for effect in effects if effect.link in links]
+
+    def _float(self, base: str | None):
+        """Put the base on virtual joints; return the link that carries them."""
+        self._require_link("base", base)
+        above = {link_names(joint)[1]: joint for joint in self.named_joints.values()}
+        for joint in self.named_joints.values():
+            if joint.get("type") == "floating":
+                base = base or link_names(joint)[1]
+        roots = [link for link in self.links if link not in above]
+        base = base or roots[0]
+        ground = f"{base} ground"
+        if base in above:
+            # What carries the base in the file is part of the ground.
+            joint = copy.deepcopy(above[base])
+            joint.set("type", "fixed")
+            joint.find("child").set("link", ground)
+            self.named_joints[joint.get("name")] = joint
+        self.links[ground] = etree.Element("link", name=ground)
+        for joint, link in virtual_elements(base, ground):
+            self.named_joints[joint.get("name")] = joint
+            self.links.setdefault(link.get("name"), link)
+        return ground
+
+    def _require_link(self, argument: str, link: str | None):
+        """Reject an argument that names no link."""
+        if link is not None and link not in self.links:
+            raise InputError(
+                f"`{argument}` must be a link of `{self.path}`, but is `{link}`; "
+                f"its links are {listed(list(self.links))}."
+            )
 
     def _add(self, joint: Any):
         """Enter a joint between the links that it connects."""
@@ -396,7 +429,8 @@ class UrdfTree(UrdfElements):
     def bodies(self, *, check: bool = False, nearest: bool = False) -> BodyParameters:
         """Return the parameters of all bodies; reject impossible links if asked to.
 
-        With `nearest`, moments of links are the nearest that can exist.
+        With `nearest`, moments of links are the nearest that can exist. Virtual joints
+        have one body together.
         """
         parameters = np.zeros((len(self.joints), 10))
         for link, (body, rotation, position) in self.carriers.items():
@@ -410,7 +444,7 @@ class UrdfTree(UrdfElements):
                     "correct its inertial."
                 )
             parameters[body] += inertia.moved(rotation, position).parameters
-        return parameters
+        return parameters[GROUP - 1 :] if self.floating else parameters
 
     def inertial(
         self, link: str, *, nearest: bool = False

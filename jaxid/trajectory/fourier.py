@@ -8,7 +8,8 @@ import scipy
 
 from jaxid.arrays import AnyArray, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.robot.robot import Robot, complete_limits
+from jaxid.robot.limits_and_drives import complete_limits
+from jaxid.robot.robot import Robot
 
 from .trajectory import (
     AbstractBasis,

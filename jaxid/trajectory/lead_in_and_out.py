@@ -10,8 +10,8 @@ import scipy
 
 from jaxid.arrays import AnyArray, Joints, double_precision, is_traced, namespace
 from jaxid.errors import InputError
-from jaxid.robot.limits_and_drives import Limits
-from jaxid.robot.robot import Robot, complete_limits
+from jaxid.robot.limits_and_drives import Limits, complete_limits
+from jaxid.robot.robot import Robot
 
 from .fourier import PeriodsBasis
 from .trajectory import (

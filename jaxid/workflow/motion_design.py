@@ -20,7 +20,8 @@ from jaxid.report.excitation_page import (
     write_excitation,
 )
 from jaxid.result_table import Remark, Status, Summarised, Table, sort_remarks
-from jaxid.robot.robot import Robot, complete_limits
+from jaxid.robot.limits_and_drives import complete_limits
+from jaxid.robot.robot import Robot
 from jaxid.trajectory.controllers import CONTROLLER_SUFFIXES, CONTROLLERS
 from jaxid.trajectory.files import (
     load_trajectory,

@@ -12,7 +12,8 @@ from jaxid.errors import InputError
 from jaxid.excitation.constraints import ForceLimits
 from jaxid.report.result_files import read_fit
 from jaxid.robot.inertia import IMPOSSIBLE
-from jaxid.robot.robot import Robot, complete_limits
+from jaxid.robot.limits_and_drives import complete_limits
+from jaxid.robot.robot import Robot
 
 from .excitation_settings import Excitation
 from .setup import Setup

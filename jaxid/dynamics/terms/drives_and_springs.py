@@ -9,7 +9,7 @@ from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 
 from .dry_friction_transitions import AbstractTransition, Tanh
-from .term import AbstractTerm, JointParameter
+from .term import AbstractTerm, JointParameter, on_drives
 
 
 class RotorInertia(AbstractTerm):
@@ -26,7 +26,7 @@ class RotorInertia(AbstractTerm):
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of accelerations."""
-        return jnp.diag(qdd)
+        return on_drives(robot, qdd)
 
 
 class TorqueRipple(AbstractTerm):
@@ -68,11 +68,10 @@ class TorqueRipple(AbstractTerm):
 
     def parameters(self, robot):
         """Return names and units: for each multiple the sines, then the cosines."""
-        units = ["N m" if is_revolute else "N" for is_revolute in robot.revolute]
         return tuple(
-            (f"{wave}_{i}", unit)
+            (f"{wave}_{robot.numbers[i]}", robot.force_unit(i))
             for wave in self.meanings
-            for i, unit in enumerate(units, 1)
+            for i in robot.driven
         )
 
     def columns(self, robot, q, qd, qdd):
@@ -82,14 +81,16 @@ class TorqueRipple(AbstractTerm):
         # Relative to the motor's own joint, on whose side the parameters are.
         ratios = A / diagonal[:, None]
         blocks = []
+        drives = np.array(robot.driven)
         for k in self.motor:
             angles = k * (A @ q)
-            blocks += [
-                ratios.T * jnp.sin(angles)[None],
-                ratios.T * jnp.cos(angles)[None],
-            ]
+            for wave in (jnp.sin(angles), jnp.cos(angles)):
+                blocks.append((ratios.T * wave[None])[:, drives])
         for k in self.joint:
-            blocks += [jnp.diag(jnp.sin(k * q)), jnp.diag(jnp.cos(k * q))]
+            blocks += [
+                on_drives(robot, jnp.sin(k * q)),
+                on_drives(robot, jnp.cos(k * q)),
+            ]
         return jnp.concatenate(blocks, axis=1)
 
 
@@ -203,7 +204,7 @@ class ConstantOffset(AbstractTerm):
 
     def columns(self, robot, q, qd, qdd):
         """Return the identity."""
-        return jnp.eye(robot.joints, dtype=q.dtype)
+        return on_drives(robot, jnp.ones_like(q))
 
 
 class LinearSpring(AbstractTerm):
@@ -225,11 +226,11 @@ class LinearSpring(AbstractTerm):
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of deflections."""
-        return jnp.diag(q - matching("rest", self.rest, q))
+        return on_drives(robot, q - matching("rest", self.rest, q))
 
     def potential_columns(self, robot, q):
         """Return half the squares of the deflections."""
-        return 0.5 * (q - self.rest) ** 2
+        return 0.5 * ((q - self.rest) ** 2)[np.array(robot.driven)]
 
 
 def _off_diagonal(ratios: np.ndarray):

@@ -14,7 +14,7 @@ from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
 
 from .dry_friction_transitions import AbstractTransition, EachJoint, Tanh
-from .term import AbstractTerm, JointParameter, NonlinearParameter
+from .term import AbstractTerm, JointParameter, NonlinearParameter, on_drives
 
 
 class AbstractDryFriction(AbstractTerm):
@@ -51,7 +51,7 @@ class ViscousFriction(AbstractTerm):
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of speeds."""
-        return jnp.diag(qd)
+        return on_drives(robot, qd)
 
 
 class AsymmetricViscousFriction(AbstractTerm):
@@ -75,8 +75,8 @@ class AsymmetricViscousFriction(AbstractTerm):
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrices of speeds in either direction."""
         speed = jnp.abs(qd)
-        forward_speeds = jnp.diag(0.5 * (qd + speed))
-        backward_speeds = jnp.diag(0.5 * (qd - speed))
+        forward_speeds = on_drives(robot, 0.5 * (qd + speed))
+        backward_speeds = on_drives(robot, 0.5 * (qd - speed))
         return jnp.concatenate([forward_speeds, backward_speeds], axis=1)
 
 
@@ -92,7 +92,7 @@ class CoulombFriction(AbstractDryFriction):
 
     def columns(self, robot, q, qd, qdd):
         """Return the diagonal matrix of smooth signs."""
-        return jnp.diag(self.transition(qd))
+        return on_drives(robot, self.transition(qd))
 
 
 class AsymmetricCoulombFriction(AbstractDryFriction):
@@ -117,8 +117,8 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
         if isinstance(dead_zone, jax.Array) or np.any(dead_zone):
             # Within a dead zone both fractions vanish, as the force does.
             motion_mask = jnp.where(s == 0.0, s, jnp.ones_like(s))
-        forward_fractions = jnp.diag(0.5 * (motion_mask + s))
-        backward_fractions = jnp.diag(0.5 * (s - motion_mask))
+        forward_fractions = on_drives(robot, 0.5 * (motion_mask + s))
+        backward_fractions = on_drives(robot, 0.5 * (s - motion_mask))
         return jnp.concatenate([forward_fractions, backward_fractions], axis=1)
 
 
@@ -146,7 +146,7 @@ class SquareRootFriction(AbstractDryFriction):
         """Return the diagonal matrix of the roots of speeds."""
         # The small number keeps the slope finite at standstill.
         root = jnp.sqrt(jnp.sqrt(qd**2 + 1e-16))
-        return jnp.diag(root * self.transition(qd))
+        return on_drives(robot, root * self.transition(qd))
 
 
 class StribeckFriction(AbstractDryFriction):
@@ -184,7 +184,9 @@ class StribeckFriction(AbstractDryFriction):
         # The small number keeps the logarithm finite at standstill.
         power = jnp.exp(0.5 * exponent * jnp.log(relative_speed**2 + 1e-30))
         static_friction = sign * jnp.exp(-power)
-        return jnp.concatenate([jnp.diag(sign), jnp.diag(static_friction)], axis=1)
+        return jnp.concatenate(
+            [on_drives(robot, sign), on_drives(robot, static_friction)], axis=1
+        )
 
     @property
     def nonlinear_parameters(self):
@@ -244,7 +246,7 @@ class LoadFriction(AbstractDryFriction):
         load = projection_equation.rigid_body_forces(
             robot, bodies, q, standstill, standstill
         )
-        return jnp.diag(jnp.abs(load) * self.transition(qd))
+        return on_drives(robot, jnp.abs(load) * self.transition(qd))
 
 
 class TemperatureScaled(AbstractTerm):

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Bodies
+from jaxid.arrays import AnyArray, Bodies
 from jaxid.dynamics import projection_equation, spatial_dynamics
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Robot
@@ -54,21 +54,35 @@ class RigidBodies(AbstractTerm):
         """Return `m1`, `mx1`, … `F1`, then those of the next body."""
         pairs = zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True)
         body_pairs = list(pairs)[: self.body_parameters]
-        bodies = range(1, robot.bodies + 1)
-        return tuple((f"{name}{i}", unit) for i in bodies for name, unit in body_pairs)
+        numbers = [robot.numbers[body] for body in robot.solid_bodies]
+        return tuple((f"{name}{i}", unit) for i in numbers for name, unit in body_pairs)
 
     def columns(self, robot, q, qd, qdd):
         r"""Return the columns $[\Theta_1 \dots \Theta_n]$ (Eq. 11)."""
         theta = projection_equation.rigid_body_regressor(robot, q, qd, qdd)
+        return self._as_columns(robot, theta)
+
+    def _as_columns(self, robot: Robot, theta: AnyArray) -> AnyArray:
+        """Return the columns of bodies that have a mass, side by side."""
+        if robot.virtual:
+            theta = theta[:, np.array(robot.solid_bodies)]
         return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
 
     def all_ten(self, robot: Robot, p: TermParameters) -> Bodies:
         """Return all ten parameters of the bodies, with zeros where left out."""
-        bodies = p.reshape(robot.bodies, self.body_parameters)
-        if not self.principal_axes:
+        solid_bodies = robot.solid_bodies
+        bodies = p.reshape(len(solid_bodies), self.body_parameters)
+        if self.principal_axes:
+            missing = len(INERTIAL_NAMES) - PRINCIPAL_PARAMETERS
+            zeros = np.zeros((len(solid_bodies), missing))
+            bodies = jnp.concatenate([bodies, zeros.astype(bodies.dtype)], axis=1)
+        if not robot.virtual:
             return bodies
-        zeros = np.zeros((robot.bodies, len(INERTIAL_NAMES) - PRINCIPAL_PARAMETERS))
-        return jnp.concatenate([bodies, zeros.astype(bodies.dtype)], axis=1)
+        zero = jnp.zeros(len(INERTIAL_NAMES), bodies.dtype)
+        rows = [zero] * robot.bodies
+        for body, parameters in zip(solid_bodies, bodies, strict=True):
+            rows[body] = parameters
+        return jnp.stack(rows)
 
     def forces(self, robot, p, q, qd, qdd):
         """Return the projected wrenches of all bodies (Eq. 11)."""
@@ -90,6 +104,7 @@ class RigidBodies(AbstractTerm):
     def potential_columns(self, robot, q):
         """Return the potential energy of masses and first moments."""
         columns = projection_equation.potential_energy_columns(robot, q)
+        columns = columns[np.array(robot.solid_bodies)]
         return columns[:, : self.body_parameters].ravel()
 
 
@@ -99,7 +114,7 @@ class SpatialBodies(RigidBodies):
     def columns(self, robot, q, qd, qdd):
         """Return the columns of all bodies (Eq. 11)."""
         theta = spatial_dynamics.spatial_regressor(robot, q, qd, qdd)
-        return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
+        return self._as_columns(robot, theta)
 
     def forces(self, robot, p, q, qd, qdd):
         """Return the generalised forces of all bodies (Eq. 11)."""

@@ -61,6 +61,12 @@ class JointParameter(NamedTuple):
     role: Literal["inertia", "viscous", "dry", "load"] | None = None
 
 
+def on_drives(robot: Robot, values: Joints) -> AnyArray:
+    """Return the diagonal matrix of some values, in the columns of driven joints."""
+    matrix = jnp.diag(values)
+    return matrix[:, np.array(robot.driven)] if robot.virtual else matrix
+
+
 class AbstractTerm(eqx.Module):
     """One effect in the equations of motion that is linear in unknown parameters.
 
@@ -97,9 +103,9 @@ class AbstractTerm(eqx.Module):
         parameters = []
         for parameter in self.joint_parameters:
             revolute_unit, prismatic_unit = parameter.units
-            for i, revolute in enumerate(robot.revolute, 1):
-                unit = revolute_unit if revolute else prismatic_unit
-                parameters.append((f"{parameter.name}{i}", unit))
+            for i in robot.driven:
+                unit = revolute_unit if robot.revolute[i] else prismatic_unit
+                parameters.append((f"{parameter.name}{robot.numbers[i]}", unit))
         return tuple(parameters)
 
     @property
@@ -147,9 +153,10 @@ class AbstractTerm(eqx.Module):
     def lower_bounds(self, robot: Robot) -> TermParameters:
         """Return lower bounds: 0, or -inf where both signs are possible."""
         bounds = np.full(len(self.parameters(robot)), -np.inf)
+        joints = len(robot.driven)
         for k, parameter in enumerate(self.joint_parameters):
             if parameter.role is not None:
-                bounds[k * robot.joints : (k + 1) * robot.joints] = 0.0
+                bounds[k * joints : (k + 1) * joints] = 0.0
         return bounds
 
     def drive_matrices(self, robot: Robot) -> np.ndarray:
@@ -159,12 +166,13 @@ class AbstractTerm(eqx.Module):
         """
         n = robot.joints
         matrices = np.zeros((2, n, n, len(self.parameters(robot))))
-        joints = np.arange(n)
+        joints = np.array(robot.driven)
+        places = np.arange(len(joints))
         roles = [parameter.role for parameter in self.joint_parameters]
         for kind, role in enumerate(("inertia", "viscous")):
             for k in range(len(roles)):
                 if roles[k] == role:
                     # Parameters of several directions of motion share the friction.
                     share = 1.0 / roles.count(role)
-                    matrices[kind, joints, joints, k * n + joints] = share
+                    matrices[kind, joints, joints, k * len(places) + places] = share
         return matrices

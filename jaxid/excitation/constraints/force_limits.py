@@ -13,7 +13,8 @@ from jaxid.dynamics.model import Coordinates
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
-from jaxid.robot.robot import Robot, complete_limits
+from jaxid.robot.limits_and_drives import complete_limits
+from jaxid.robot.robot import Robot
 
 from .constraint import (
     AbstractConstraint,
