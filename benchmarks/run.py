@@ -69,6 +69,7 @@ METHODS = (
     Script("held_out", 10),
     Script("friction", 60),
     Script("states", 5),
+    Script("agreement", 10),
     Script("rollout", 55),
     Script("transients", 1),
     Script("excitation", 60),

@@ -44,6 +44,7 @@ from .identification import (
     friction_laws as friction_laws,
     uncertainty as uncertainty,
 )
+from .identification.agreement import agreement as agreement
 from .identification.combination import combine_fits as combine_fits
 from .identification.consistency import PhysicallyConsistent as PhysicallyConsistent
 from .identification.delay import with_unknown_delay as with_unknown_delay

@@ -311,6 +311,7 @@ for command in (
     choose,
     report_commands.export,
     report_commands.compare,
+    report_commands.agree,
     payload_gains_states_rollout.payload,
     payload_gains_states_rollout.gains,
     payload_gains_states_rollout.states,

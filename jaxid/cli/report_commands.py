@@ -1,4 +1,4 @@
-"""Commands that take reports: `export` and `compare`."""
+"""Commands that take reports: `export`, `compare` and `agree`."""
 
 import dataclasses
 from collections.abc import Sequence
@@ -169,4 +169,28 @@ def compare(
         report = jid.experiment.compare_reports((first, second), log, progress)
         settings = {"command": options.command_line()}
         files = dataclasses.replace(report, settings=settings).save(output)
+    terminal.show_result(console, detail, report, output, files)
+
+
+def agree(
+    reports: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Reports of one robot, in the order of the runs.", metavar="REPORTS"
+        ),
+    ],
+    output: options.OutputFolder = Path("agreement"),
+    force: options.Force = False,
+    detail: options.Detail = None,
+) -> None:
+    """Compare several runs: which ones differ, and why.
+
+    Each report is a folder that `jaxid identify`, `rollout` or `calibrate` has written.
+    The others are pooled into one estimate, whose intervals include the differences
+    between runs.
+    """
+    console = options.start(*reports, output=output, force=force)
+    report = jid.workflow.agree_reports(reports)
+    settings = {"command": options.command_line()}
+    files = dataclasses.replace(report, settings=settings).save(output)
     terminal.show_result(console, detail, report, output, files)

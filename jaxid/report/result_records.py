@@ -28,6 +28,7 @@ KINDS = (
     "states",
     "demo",
     "rollout",
+    "agreement",
 )
 SCHEMAS = {f"{kind}.json": f"jaxid-{kind}/1" for kind in KINDS}
 """Files that hold results, and the schemas in them."""

@@ -31,7 +31,7 @@ class RunsReport(Summarised):
     """Result of several runs, and findings on their logs.
 
     Attributes:
-        kind: Kind of the result: "payload", "gains", "states" or "rollout".
+        kind: Kind of the result, such as "payload" or "states".
         result: The result.
         answer: What the page says and shows.
         estimates: Estimates in the files, one row each.
@@ -39,6 +39,7 @@ class RunsReport(Summarised):
         sources: Logs and reports of each run.
         findings: Findings on the logs, mostly doubts.
         details: Tables beside that of the result.
+        glance: Tables of the overview, if it is not that of the result.
         settings: Origin of the result, as `provenance` takes it.
     """
 
@@ -50,6 +51,7 @@ class RunsReport(Summarised):
     sources: Mapping[str, Sequence[Path]]
     findings: Sequence[Remark]
     details: Sequence[Table] = ()
+    glance: Sequence[Table] = ()
     settings: Settings = dataclasses.field(default_factory=dict)
 
     @property
@@ -72,8 +74,7 @@ class RunsReport(Summarised):
     def overview(self) -> list[Table]:
         """Return the verdict, the findings, and the one table of the answer."""
         findings = Table("", remarks=dict.fromkeys([self.verdict, *self.findings]))
-        # Each change of a state has a table of kinds, then one of parameters.
-        return [findings, *(self.details[::2] or [self.result.summary()])]
+        return [findings, *(self.glance or [self.result.summary()])]
 
     def save(self, folder: FilePath) -> list[Path]:
         """Write a page, and the numbers as JSON and CSV; return the files."""

@@ -23,6 +23,7 @@ from .payload_gains_and_states import (
     identify_payload_from_logs as identify_payload_from_logs,
     identify_states_from_logs as identify_states_from_logs,
 )
+from .report_agreement import agree_reports as agree_reports
 from .robot_file import RobotFile as RobotFile
 from .setup import LogReading as LogReading, Setup as Setup
 from .surroundings import Collision as Collision

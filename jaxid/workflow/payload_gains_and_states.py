@@ -294,7 +294,8 @@ def identify_states_from_logs(
         )
     first_state, *other_states = groups
     comparisons = [states.compare(first_state, state) for state in other_states]
-    tables = [table for x in comparisons for table in (x.group_summary(), x.summary())]
+    kind_tables = [comparison.group_summary() for comparison in comparisons]
+    parameter_tables = [comparison.summary() for comparison in comparisons]
     progress("predicting torques", 0.0)
     errors = {
         state: errors_of(fit, states.fit(state).parameters, logs)
@@ -316,5 +317,6 @@ def identify_states_from_logs(
         content,
         {"states": paths},
         _as_doubts(doubts),
-        details=tables,
+        details=[*kind_tables, *parameter_tables],
+        glance=kind_tables,
     )
