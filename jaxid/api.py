@@ -82,9 +82,10 @@ from .program.jax_compilation_cache import (
     enable_compilation_cache as enable_compilation_cache,
 )
 from .robot import collision as collision, robots as robots
+from .robot.inertia import Tool as Tool
 from .robot.library import from_dh as from_dh
 from .robot.limits_and_drives import Drives as Drives, Limits as Limits
-from .robot.robot import Robot as Robot, Tool as Tool
+from .robot.robot import Robot as Robot
 from .robot.urdf import load_mjcf as load_mjcf, load_urdf as load_urdf
 from .rollout.identify import identify_rollout as identify_rollout
 from .simulation.virtual import VirtualRobot as VirtualRobot

@@ -17,7 +17,7 @@ from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.filters import FILTERS
 from jaxid.measurement.log_files import summarise_columns
-from jaxid.robot.robot import Tool
+from jaxid.robot.inertia import Tool
 from jaxid.workflow.excitation_settings import Excitation
 from jaxid.workflow.log_loading import is_report
 from jaxid.workflow.log_rollout import ServoSettings, TorqueSettings

@@ -12,8 +12,9 @@ from jaxid.errors import InputError
 from jaxid.experiment_values import PerJoint, TomlTable, Vector
 from jaxid.measurement.columns import Columns
 from jaxid.robot import library
+from jaxid.robot.inertia import Tool
 from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
-from jaxid.robot.robot import Robot, Tool
+from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
 from jaxid.robot.shapes import HalfSpace
 from jaxid.workflow.robot_file import RobotFile, joint_number

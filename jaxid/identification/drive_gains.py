@@ -16,7 +16,8 @@ from jaxid.arrays import AnyArray, Float, Joints, Texts
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.result_table import Remark, Status, Summarised, Table, percent
-from jaxid.robot.robot import Robot, Tool
+from jaxid.robot.inertia import Tool
+from jaxid.robot.robot import Robot
 
 from .combination import as_least_squares, combine, require_same_base
 from .estimators.regularisation_and_weights import Decomposition

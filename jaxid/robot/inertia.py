@@ -1,5 +1,7 @@
 """Mass, centre of mass and inertia tensor of a body, in several parametrisations."""
 
+import dataclasses
+
 import equinox as eqx
 import numpy as np
 
@@ -10,9 +12,12 @@ from jaxid.arrays import (
     Numbers,
     Vector3,
     as_array,
+    as_finite_array,
+    given,
     is_traced,
     namespace,
 )
+from jaxid.errors import InputError
 
 from .limits_and_drives import DOUBTFUL_LENGTH
 from .rotations import Rotations, Vectors
@@ -199,3 +204,50 @@ def _moments_of_points(r: Vectors):
     products = r[..., :, None] * r[..., None, :]
     identity = np.broadcast_to(np.eye(3), products.shape)
     return squares * identity - products
+
+
+class Tool(eqx.Module):
+    """Load of known mass on a body: its forces are subtracted, not identified.
+
+    Args:
+        body: Index of the body that carries it (0 is the first).
+        mass: Mass [kg].
+        centre_of_mass: Centre of mass in the frame of the body [m].
+        inertia: Inertia tensor about the centre of mass, along the body's axes [kg m²];
+            a point mass if None.
+
+    Raises:
+        InputError: If the mass is not positive, or no body has such an inertia.
+    """
+
+    body: int = eqx.field(static=True)
+    _: dataclasses.KW_ONLY
+    mass: AnyArray = eqx.field(converter=given)
+    centre_of_mass: Vector3 = eqx.field(converter=given)
+    inertia: Matrix3 = eqx.field(converter=given, default=None)
+
+    def __post_init__(self):
+        self.mass = as_finite_array("`mass` of the tool", self.mass, ())
+        self.centre_of_mass = as_finite_array(
+            "`centre_of_mass` of the tool",
+            self.centre_of_mass,
+            (3,),
+        )
+        tensor = np.zeros((3, 3)) if self.inertia is None else self.inertia
+        self.inertia = as_finite_array("`inertia` of the tool", tensor, (3, 3))
+        if not is_traced(self.mass) and self.mass <= 0:
+            raise InputError(
+                f"`mass` of the tool must be positive, but is {self.mass:g} kg."
+            )
+        if reason := self.body_inertia.fault():
+            raise InputError(f"the tool cannot exist: {reason}.")
+
+    @property
+    def body_inertia(self) -> Inertia:
+        """Mass, centre of mass and tensor in the frame of the body."""
+        return Inertia(self.mass, self.centre_of_mass, self.inertia)
+
+    @property
+    def parameters(self) -> AnyArray:
+        """Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin (Eqs. 8, 9)."""
+        return self.body_inertia.parameters

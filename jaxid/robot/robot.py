@@ -15,66 +15,18 @@ from jaxid.arrays import (
     Vector3,
     as_finite_array,
     given,
-    is_traced,
     namespace,
 )
 from jaxid.errors import InputError
 from jaxid.result_table import Column, Remark, Status, Summarised, Table
 
 from .follower_joints import Followers, order_from_ground
-from .inertia import IMPOSSIBLE, Inertia
+from .inertia import IMPOSSIBLE, Tool
 from .limits_and_drives import MAX_LENGTH, Drives, Limits, length_notes, limit_notes
 from .rotations import SNAP_TOLERANCE, snapped, snapped_rotations
-from .virtual_joints import GROUP, numbers_of_bodies
+from .virtual_joints import GROUP, numbers_of_bodies, with_sensor
 
 GRAVITY = (0.0, 0.0, -9.81)
-
-
-class Tool(eqx.Module):
-    """Load of known mass on a body: its forces are subtracted, not identified.
-
-    Args:
-        body: Index of the body that carries it (0 is the first).
-        mass: Mass [kg].
-        centre_of_mass: Centre of mass in the frame of the body [m].
-        inertia: Inertia tensor about the centre of mass, along the body's axes [kg m²];
-            a point mass if None.
-
-    Raises:
-        InputError: If the mass is not positive, or no body has such an inertia.
-    """
-
-    body: int = eqx.field(static=True)
-    _: dataclasses.KW_ONLY
-    mass: AnyArray = eqx.field(converter=given)
-    centre_of_mass: Vector3 = eqx.field(converter=given)
-    inertia: Matrix3 = eqx.field(converter=given, default=None)
-
-    def __post_init__(self):
-        self.mass = as_finite_array("`mass` of the tool", self.mass, ())
-        self.centre_of_mass = as_finite_array(
-            "`centre_of_mass` of the tool",
-            self.centre_of_mass,
-            (3,),
-        )
-        tensor = np.zeros((3, 3)) if self.inertia is None else self.inertia
-        self.inertia = as_finite_array("`inertia` of the tool", tensor, (3, 3))
-        if not is_traced(self.mass) and self.mass <= 0:
-            raise InputError(
-                f"`mass` of the tool must be positive, but is {self.mass:g} kg."
-            )
-        if reason := self.body_inertia.fault():
-            raise InputError(f"the tool cannot exist: {reason}.")
-
-    @property
-    def body_inertia(self) -> Inertia:
-        """Mass, centre of mass and tensor in the frame of the body."""
-        return Inertia(self.mass, self.centre_of_mass, self.inertia)
-
-    @property
-    def parameters(self) -> AnyArray:
-        """Parameters $(m, m r_c, A, B, C, D, E, F)$ about the origin (Eqs. 8, 9)."""
-        return self.body_inertia.parameters
 
 
 class Robot(Summarised, eqx.Module):
@@ -276,6 +228,11 @@ class Robot(Summarised, eqx.Module):
         return self.virtual[GROUP:] if self.floating else self.virtual
 
     @property
+    def sensor_bodies(self) -> tuple[int, ...]:
+        """Indices of the bodies behind force sensors."""
+        return self.rigid[GROUP - 1 :: GROUP]
+
+    @property
     def solid_bodies(self) -> tuple[int, ...]:
         """Indices of the bodies that have a mass."""
         massless = {*self.virtual} - {*self.virtual[GROUP - 1 :: GROUP]}
@@ -418,6 +375,35 @@ class Robot(Summarised, eqx.Module):
             placed_tool, centre_of_mass=load.centre, inertia=load.tensor
         )
         return self.replace(tool=tool)
+
+    def with_sensor(
+        self,
+        rotation: Numbers | None = None,
+        position: Numbers = (0.0, 0.0, 0.0),
+        *,
+        under_base: bool = False,
+    ) -> "Robot":
+        """Return the robot with a six-axis force sensor, whose wrench it measures.
+
+        A body called `sensor` is then behind the end-effector's frame, and carries the
+        end-effector; or one called `base` is between the ground and the arm. The wrench
+        is that which the sensor exerts on this body, along the axes of the sensor's
+        frame and about its origin: at rest its force points up.
+
+        Args:
+            rotation: Attitude of the sensor's frame in that of the end-effector or of
+                the ground; the same if None.
+            position: Origin of the sensor's frame there [m].
+            under_base: Whether the sensor is under the base.
+
+        Raises:
+            InputError: If there is a sensor already, the attitude is no rotation, or
+                the position no point.
+        """
+        attitude = np.eye(3) if rotation is None else rotation
+        R = as_rotations("`rotation` of the sensor", attitude, (3, 3))
+        r = as_finite_array("`position` of the sensor", position, (3,))
+        return with_sensor(self, R, r, under_base=under_base)
 
     def joint_unit(self, joint: int) -> str:
         """Return the unit of a joint's coordinate: rad or m."""

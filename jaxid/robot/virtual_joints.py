@@ -13,6 +13,7 @@ from typing import Any
 import numpy as np
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
+from jaxid.arrays import Matrix3, Vector3
 from jaxid.errors import InputError
 
 GROUP = 6
@@ -70,31 +71,95 @@ def on_virtual_joints(robot: Any, name: str, *, floating: bool) -> Any:
     Raises:
         InputError: If the robot stands on virtual joints already.
     """
+    _refuse_second_base(robot)
+    at_origin = with_group(robot, name, 0, -1, np.eye(3), np.zeros(3))
+    return at_origin.replace(
+        gravity=np.zeros(3) if floating else robot.gravity, floating=floating
+    )
+
+
+def _refuse_second_base(robot: Any) -> None:
+    """Refuse a robot that stands on virtual joints already."""
     if robot.virtual[:1] == (0,):
         raise InputError(f"`{robot.name}` has a base that floats or is measured.")
-    followers = tuple(
-        dataclasses.replace(x, leader=x.leader + GROUP) for x in robot.followers
-    )
+
+
+def with_group(
+    robot: Any,
+    name: str,
+    start: int,
+    carrier: int,
+    rotation: Matrix3,
+    position: Vector3,
+) -> Any:
+    """Return the robot with six virtual joints, and the body behind them.
+
+    Args:
+        robot: The robot.
+        name: Name of the body.
+        start: Index of the first virtual joint: 0 to carry all bodies on the ground, or
+            the number of joints.
+        carrier: Index of the body that carries the joints; -1 for the ground.
+        rotation: Attitude of the joints in the carrier.
+        position: Origin of the joints in the carrier [m].
+    """
+
+    def moved(body: int) -> int:
+        return body + GROUP if body >= start else body
+
+    def inserted(values: Any, group: Any) -> Any:
+        return [*values[:start], *group, *values[start:]]
+
+    # What stood on the ground stands on the base.
+    parents = [moved(body) for body in robot.parent]
+    if carrier < 0:
+        parents = [GROUP - 1 if body < 0 else body for body in parents]
+    group = range(start, start + GROUP)
+    names = [f"{name} {ending}" for ending in FORCE_NAMES]
+    followers = [
+        dataclasses.replace(x, leader=moved(x.leader)) for x in robot.followers
+    ]
     tool = robot.tool
     if tool is not None:
-        tool = dataclasses.replace(tool, body=tool.body + GROUP)
-    names = tuple(f"{name} {ending}" for ending in FORCE_NAMES)
-    eyes = np.broadcast_to(np.eye(3), (GROUP, 3, 3))
+        tool = dataclasses.replace(tool, body=moved(tool.body))
+    padding = (GROUP, 0) if start == 0 else (0, GROUP)
+    rotations = [rotation, *np.tile(np.eye(3), (GROUP - 1, 1, 1))]
+    offsets = [position, *np.zeros((GROUP - 1, 3))]
     return robot.replace(
-        joint_names=(*names, *robot.joint_names),
-        parent=(*range(-1, GROUP - 1), *(parent + GROUP for parent in robot.parent)),
-        followers=followers,
-        revolute=(False, False, False, True, True, True, *robot.revolute),
-        axis=np.concatenate([np.tile(np.eye(3), (2, 1)), robot.axis]),
-        rotation=np.concatenate([eyes, robot.rotation]),
-        offset=np.concatenate([np.zeros((GROUP, 3)), robot.offset]),
-        gravity=np.zeros(3) if floating else robot.gravity,
-        limits=padded(robot.limits, GROUP, 0),
-        drives=padded(robot.drives, GROUP, 0),
+        joint_names=tuple(inserted(robot.joint_names, names)),
+        parent=tuple(inserted(parents, [carrier, *group[:-1]])),
+        followers=tuple(followers),
+        revolute=tuple(inserted(robot.revolute, np.arange(GROUP) >= 3)),
+        axis=np.array(inserted(robot.axis, np.tile(np.eye(3), (2, 1)))),
+        rotation=np.array(inserted(robot.rotation, rotations)),
+        offset=np.array(inserted(robot.offset, offsets)),
+        limits=padded(robot.limits, *padding),
+        drives=padded(robot.drives, *padding),
         tool=tool,
-        tip_body=robot.tip_body + GROUP,
-        virtual=(*range(GROUP), *(joint + GROUP for joint in robot.virtual)),
-        floating=floating,
+        tip_body=moved(robot.tip_body),
+        virtual=tuple(sorted([*map(moved, robot.virtual), *group])),
+    )
+
+
+def with_sensor(
+    robot: Any, rotation: Matrix3, position: Vector3, *, under_base: bool
+) -> Any:
+    """Return the robot with a six-axis force sensor, as `Robot.with_sensor` does."""
+    if under_base:
+        _refuse_second_base(robot)
+        # What stands on the ground stands in the frame of the sensor.
+        on_sensor = robot.mounted(rotation.T, -rotation.T @ position)
+        return with_group(on_sensor, "base", 0, -1, rotation, position)
+    if robot.sensor_bodies[-1:] == (robot.tip_body,):
+        raise InputError(f"`{robot.name}` has a sensor at its end-effector already.")
+    attitude = robot.tip_rotation @ rotation
+    origin = robot.tip_offset + robot.tip_rotation @ position
+    start = robot.joints
+    behind = with_group(robot, "sensor", start, robot.tip_body, attitude, origin)
+    return behind.replace(
+        tip_body=start + GROUP - 1,
+        tip_rotation=rotation.T,
+        tip_offset=-rotation.T @ position,
     )
 
 

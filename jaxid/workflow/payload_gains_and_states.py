@@ -36,8 +36,7 @@ from jaxid.report.payload_gains_states_pages import (
 from jaxid.report.result_records import estimate_rows
 from jaxid.report.several_runs_report import RunsReport
 from jaxid.result_table import Remark, Status
-from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
-from jaxid.robot.robot import Tool
+from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS, Tool
 from jaxid.validation.diagnosis import mistakes_in_logs
 from jaxid.validation.torque_errors import TorqueErrors, torque_errors
 

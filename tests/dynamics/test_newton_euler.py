@@ -8,7 +8,7 @@ import trees
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import RigidBodies
-from jaxid.robot.robot import Tool
+from jaxid.robot.inertia import Tool
 
 BODIES = (RigidBodies(),)
 TREE = trees.mixed_tree(0)

@@ -10,10 +10,11 @@ from jaxid.errors import InputError
 from jaxid.result_table import Status
 from jaxid.robot.capsule_fit import fit_capsules
 from jaxid.robot.collision import Box, Capsule, CollisionModel, HalfSpace
+from jaxid.robot.inertia import Tool
 from jaxid.robot.inverse_kinematics import inverse_kinematics_along
 from jaxid.robot.library import from_dh, panda, planar_arm
 from jaxid.robot.limits_and_drives import Drives, Limits
-from jaxid.robot.robot import Robot, Tool
+from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import load_urdf, urdf_parameters
 from jaxid.workflow.robot_file import RobotFile
 

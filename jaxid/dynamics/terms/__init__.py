@@ -14,6 +14,10 @@ from .dry_friction_transitions import (
     Reversal as Reversal,
     Tanh as Tanh,
 )
+from .force_sensors import (
+    SensorBias as SensorBias,
+    SensorRotation as SensorRotation,
+)
 from .friction import (
     AsymmetricCoulombFriction as AsymmetricCoulombFriction,
     AsymmetricViscousFriction as AsymmetricViscousFriction,
@@ -46,5 +50,7 @@ TERMS: dict[str, type[AbstractTerm]] = {
     "coupled_drives": CoupledDrives,
     "springs": LinearSpring,
     "temperature": TemperatureScaled,
+    "sensor_bias": SensorBias,
+    "sensor_rotation": SensorRotation,
 }
 """All terms by name, in the order in which a model of an experiment file has them."""

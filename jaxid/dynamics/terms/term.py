@@ -83,6 +83,7 @@ class AbstractTerm(eqx.Module):
             if it is not tried there.
         choice_keys: Keys of the file's table `[model]` that add the effect there; those
             of a switch if empty.
+        is_of_sensors: Whether the parameters belong to force sensors.
         shares_friction: Whether the term is a part of the friction beside which other
             parts may be negative, since only the sum of all parts cannot.
     """
@@ -92,6 +93,7 @@ class AbstractTerm(eqx.Module):
     choice: ClassVar[str] = ""
     choice_keys: ClassVar[dict[str, Any]] = {}
     shares_friction: ClassVar[bool] = False
+    is_of_sensors: ClassVar[bool] = False
 
     @classmethod
     def with_transition(cls, transition: Any) -> "AbstractTerm":
