@@ -19,6 +19,7 @@ import numpy as np
 import pinocchio as pin
 import polars as pl
 import pytest
+from closed_chains import MECHANISMS
 
 import jaxid as jid
 from jaxid.cli import app as cli
@@ -177,6 +178,10 @@ def given(tmp_path_factory):
         _table(one, degrees=False).write_parquet(folder / "logs" / f"{k}.parquet")
     _write_lerobot(log, folder / "lerobot" / "data" / "chunk-000")
     jid.simulation.write_example(folder / "example")
+    five_bar = MECHANISMS["five-bar"].text
+    (folder / "five_bar.xml").write_text(five_bar)
+    tree = five_bar.replace("<connect", "<connect active='false'")
+    (folder / "five_bar_tree.xml").write_text(tree)
     base = jid.base_parameters(model)
     smooth, every = jid.ZeroPhaseButterworth(10.0), jid.Subsample(40)
     seen = [jid.observe(x, robot, smooth, every) for x in (log, second, *single)]

@@ -180,7 +180,8 @@ class BaseParameters(Summarised, Hashable):
         model = self.model
         if model.robot.tool is None:
             return np.zeros(motion.q.shape)
-        return in_numpy(model, model.known_forces, motion.q, motion.qd, motion.qdd)
+        q = model.closed(motion.q)
+        return in_numpy(model, model.known_forces, q, motion.qd, motion.qdd)
 
     def regressor(self, motion: Motion) -> AnyArray:
         r"""Return the base regressor $\Theta_B$ [*batch, joints, base] (Eq. 23)."""
@@ -231,7 +232,7 @@ class BaseParameters(Summarised, Hashable):
 
     def mass_matrix(self, p: Parameters, q: Coordinates) -> AnyArray:
         """Return the mass matrix, which base parameters determine (Eq. 38)."""
-        return on_samples(self, self.inertia, self.model.check(q), shared=(p,))
+        return on_samples(self, self.inertia, self.model.closed(q), shared=(p,))
 
     @property
     def identifiability(self) -> tuple[Identifiability, ...]:

@@ -23,6 +23,7 @@ from jaxid.arrays import (
 from jaxid.errors import InputError
 from jaxid.program import Shape
 from jaxid.program.sample_methods import on_samples, spatial_form
+from jaxid.robot.joint_coordinates import at_sample
 from jaxid.robot.robot import Robot
 
 from . import projection_equation
@@ -136,10 +137,12 @@ class Model(Hashable):
     @property
     def input_shapes(self) -> list[Shape]:
         """Shapes of the arguments of `columns`."""
-        standstill = np.zeros(self.robot.joints)
+        robot = self.robot
+        standstill = np.zeros(robot.joints)
         law = self.memory
         states = [] if law is None else [law.settled(standstill).shape]
-        return [standstill.shape] * 3 + states
+        coordinates = robot.bodies if robot.loops else robot.joints
+        return [(coordinates,), standstill.shape, standstill.shape, *states]
 
     def with_memory(self, **changes: Any) -> "Model":
         """Return the model with other fields of `memory`, such as `length`."""
@@ -165,38 +168,39 @@ class Model(Hashable):
         Where a motion does not have the state, its samples are a path in the order of
         time.
         """
-        self.check(motion.q)
+        q = self.closed(motion.q)
         law = self.memory
         state = motion.state
         if law is None:
-            return motion.q, motion.qd, motion.qdd
+            return q, motion.qd, motion.qdd
         if state is None and motion.qd.ndim == 1:
             state = law.settled(motion.qd)
         elif state is None:
             start = law.settled(motion.qd[..., 0, :])
             state = law.states(motion.q, start)
-        return motion.q, motion.qd, motion.qdd, state
+        return q, motion.qd, motion.qdd, state
 
     def columns(self, q, qd, qdd, s=None) -> AnyArray:
         r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
+        robot, q = at_sample(self.robot, q)
         terms = self.terms if s is None else self.with_memory(state=s).terms
-        return jnp.concatenate(
-            [t.columns(self.robot, q, qd, qdd) for t in terms], axis=1
-        )
+        return jnp.concatenate([t.columns(robot, q, qd, qdd) for t in terms], axis=1)
 
     def forces(self, p, q, qd, qdd, s=None) -> Joints:
         """Return the generalised forces of one sample by definition (Eqs. 11, 15)."""
+        robot, q = at_sample(self.robot, q)
         model = self if s is None else self.with_memory(state=s)
         parts = model.split(p)
-        return reduce(add, (t.forces(self.robot, x, q, qd, qdd) for t, x in parts))
+        return reduce(add, (t.forces(robot, x, q, qd, qdd) for t, x in parts))
 
     def inertia(self, p, q) -> JointMatrix:
         """Return the mass matrix of one sample by definition (Eq. 38)."""
-        return reduce(add, (t.mass_matrix(self.robot, x, q) for t, x in self.split(p)))
+        robot, q = at_sample(self.robot, q)
+        return reduce(add, (t.mass_matrix(robot, x, q) for t, x in self.split(p)))
 
     def bias(self, p, q, qd, s=None) -> Joints:
         """Return the bias forces of one sample by definition (Eq. 38)."""
-        return self.forces(p, q, qd, jnp.zeros_like(q), s)
+        return self.forces(p, q, qd, jnp.zeros_like(qd), s)
 
     def acceleration(self, p, q, qd, forces) -> Joints:
         """Return the accelerations of one sample that forces cause (Eq. 38)."""
@@ -206,9 +210,9 @@ class Model(Hashable):
 
     def potential(self, p, q) -> AnyArray:
         """Return the potential energy of one sample by definition."""
-        return reduce(
-            add, (t.potential_columns(self.robot, q) @ x for t, x in self.split(p))
-        )
+        robot, q = at_sample(self.robot, q)
+        parts = self.split(p)
+        return reduce(add, (t.potential_columns(robot, q) @ x for t, x in parts))
 
     @property
     def spatial_form(self) -> "SpatialModel":
@@ -219,7 +223,7 @@ class Model(Hashable):
         """Return the generalised forces of the known tool at one sample [N m or N]."""
         tool = self.robot.tool
         if tool is None:
-            return jnp.zeros_like(q)
+            return jnp.zeros_like(qd)
         bodies: list[AnyArray] = [np.zeros(10)] * self.robot.bodies
         bodies[tool.body] = tool.parameters
         p = namespace(tool.parameters).stack(bodies)
@@ -281,7 +285,7 @@ class Model(Hashable):
             p: Standard parameters.
             q: Joint coordinates [rad or m].
         """
-        return on_samples(self, self.inertia, self.check(q), shared=(p,))
+        return on_samples(self, self.inertia, self.closed(q), shared=(p,))
 
     def bias_forces(self, p: Parameters, *state: Motion | Coordinates) -> ManyJoints:
         r"""Return the forces $h(q, \dot q)$ at zero acceleration [N m or N] (Eq. 38).
@@ -292,7 +296,7 @@ class Model(Hashable):
                 velocities.
         """
         q, qd = as_state(*state)
-        return on_samples(self, self.bias, self.check(q), self.check(qd), shared=(p,))
+        return on_samples(self, self.bias, self.closed(q), self.check(qd), shared=(p,))
 
     def forward_dynamics(self, p: Parameters, *state_and_forces: Any) -> ManyJoints:
         r"""Return the accelerations $M^{-1} (Q_m - h)$ that forces cause (Eq. 38).
@@ -305,7 +309,7 @@ class Model(Hashable):
         """
         *state, forces = state_and_forces
         q, qd = as_state(*state)
-        samples = (self.check(x) for x in (q, qd, forces))
+        samples = (self.closed(q), self.check(qd), self.check(forces))
         return on_samples(self, self.acceleration, *samples, shared=(p,))
 
     def kinetic_energy(self, p: Parameters, *state: Motion | Coordinates) -> AnyArray:
@@ -323,12 +327,21 @@ class Model(Hashable):
 
     def potential_energy(self, p: Parameters, q: Coordinates) -> AnyArray:
         """Return the potential energy [J], zero at the ground's origin."""
-        return on_samples(self, self.potential, self.check(q), shared=(p,))
+        return on_samples(self, self.potential, self.closed(q), shared=(p,))
 
     def tool_forces(self, motion: Motion) -> ManyJoints:
         """Return the forces of the known tool [N m or N]; zero without a tool."""
-        self.check(motion.q)
-        return on_samples(self, self.known_forces, motion.q, motion.qd, motion.qdd)
+        q = self.closed(motion.q)
+        return on_samples(self, self.known_forces, q, motion.qd, motion.qdd)
+
+    def closed(self, q: Coordinates) -> AnyArray:
+        """Return coordinates as `check`, but those of all joints where loops move some.
+
+        Raises:
+            InputError: If the last axis has another length, or loops do not close.
+        """
+        q = self.check(q)
+        return self.robot.close(q) if self.robot.loops else q
 
     def check(self, q: Coordinates) -> ManyJoints:
         """Return coordinates as an array with one number for each joint.

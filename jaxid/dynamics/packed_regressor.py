@@ -113,15 +113,16 @@ def gram(
     owner: eqx.Module, definition: Callable, weights: AnyArray | None, *arrays: AnyArray
 ) -> Array:
     """Return the Gram matrix of a model's columns over a motion; see `Model.gram`."""
-    joints = _check_positions(owner, arrays[0])
+    _check_positions(owner, arrays[0])
+    joints = arrays[1].shape[1]
     weights = np.ones(joints) if weights is None else as_array("weights", weights)
-    regressor = JointRegressor(owner, definition, *((joints,) for _ in arrays))
+    regressor = JointRegressor(owner, definition, *(x.shape[1:] for x in arrays))
     run = regressor.gram if is_traced(arrays, weights) else _compiled_gram(regressor)
     return run(jnp.asarray(weights, arrays[0].dtype), *arrays)
 
 
 def _check_positions(owner: eqx.Module, q: AnyArray):
-    """Require many samples and a robot of known geometry; return the joints' number."""
+    """Require many samples and a robot of known geometry."""
     if q.ndim != 2:
         raise InputError(
             f"`motion` must have the shape [samples, joints], but has {q.shape}."
@@ -130,7 +131,6 @@ def _check_positions(owner: eqx.Module, q: AnyArray):
         raise InputError(
             "a packed regressor needs a robot whose geometry is known: use `regressor`."
         )
-    return q.shape[1]
 
 
 class PackedRegressor(eqx.Module):

@@ -16,9 +16,16 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Bodies, JointMatrix, Joints, Matrix3, Vector3
-from jaxid.robot.follower_joints import all_coordinates, all_rates, on_coordinates
-from jaxid.robot.forward_kinematics import placement_in_parent, placements
+from jaxid.robot.forward_kinematics import placements
 from jaxid.robot.inertia import inertia_tensor
+from jaxid.robot.joint_coordinates import (
+    all_accelerations,
+    all_coordinates,
+    all_rates,
+    at_sample,
+    on_coordinates,
+    placement_in_parent,
+)
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import skew
 
@@ -32,9 +39,9 @@ def body_motions(
         For each body the acceleration of its origin less gravity [m/s²], its angular
         velocity [rad/s] and its angular acceleration [rad/s²].
     """
-    q = all_coordinates(robot.followers, q)
-    qd = all_rates(robot.followers, qd)
-    qdd = all_rates(robot.followers, qdd)
+    qdd = all_accelerations(robot, q, qd, qdd)
+    qd = all_rates(robot, q, qd)
+    q = all_coordinates(robot, q)
     ground = (-robot.gravity, np.zeros(3), np.zeros(3))
     motions: list[tuple[Vector3, Vector3, Vector3]] = [ground] * robot.bodies
     for i in robot.order:
@@ -73,7 +80,7 @@ def partial_velocities(robot: Robot, q: Joints) -> Iterator[tuple[int, int, AnyA
         For each body and each joint that moves it their numbers and the row (Eqs. 5,
         7).
     """
-    q = all_coordinates(robot.followers, q)
+    q = all_coordinates(robot, q)
     rows: list[dict[int, AnyArray]] = [{} for _ in range(robot.bodies)]
     for i in robot.order:
         with jax.named_scope(f"motion_{i}"):
@@ -141,7 +148,7 @@ def rigid_body_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> An
         with jax.named_scope(f"columns_{i}_{j}"):
             columns[j][i] = row @ bodies[i]
     rows = jnp.stack([jnp.stack(blocks) for blocks in columns])
-    return on_coordinates(robot.followers, rows)
+    return on_coordinates(robot, q, rows)
 
 
 def rigid_body_forces(
@@ -160,7 +167,8 @@ def joint_forces(robot: Robot, wrenches: list[AnyArray], q: Joints) -> Joints:
 
     A body passes its wrench on to its parent, and each joint feels what passes it.
     """
-    q = all_coordinates(robot.followers, q)
+    robot, y = at_sample(robot, q)
+    q = all_coordinates(robot, y)
     wrenches = list(wrenches)
     forces: list[Any] = [None] * robot.bodies
     for i in reversed(robot.order):
@@ -177,7 +185,7 @@ def joint_forces(robot: Robot, wrenches: list[AnyArray], q: Joints) -> Joints:
             moment = R @ moment + jnp.cross(r, force)
             wrench = jnp.concatenate([force, moment])
             wrenches[parent] = wrenches[parent] + wrench
-    return on_coordinates(robot.followers, jnp.stack(forces))
+    return on_coordinates(robot, y, jnp.stack(forces))
 
 
 def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
@@ -189,7 +197,8 @@ def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     the ground and felt by every joint on the way.
     """
     n = robot.bodies
-    q = all_coordinates(robot.followers, q)
+    robot, y = at_sample(robot, q)
+    q = all_coordinates(robot, y)
     frames = []
     for i in range(n):
         with jax.named_scope(f"frame_{i}"):
@@ -217,8 +226,8 @@ def rigid_body_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
                 force = R @ force
                 moment = R @ moment + jnp.cross(r, force)
             j = robot.parent[j]
-    rows = on_coordinates(robot.followers, jnp.stack([jnp.stack(row) for row in M]))
-    return on_coordinates(robot.followers, rows.T).T
+    rows = on_coordinates(robot, y, jnp.stack([jnp.stack(row) for row in M]))
+    return on_coordinates(robot, y, rows.T).T
 
 
 def composite_bodies(

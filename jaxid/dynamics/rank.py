@@ -15,6 +15,7 @@ import scipy
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.program.sample_methods import in_numpy
+from jaxid.robot.joint_coordinates import reachable
 from jaxid.units.dimensions import length_power
 
 from .model import Model
@@ -185,7 +186,7 @@ def random_regressor(model: Model, seed: int) -> tuple[np.ndarray, np.ndarray]:
     joints = model.robot.joints
     samples = max(25, math.ceil(3.0 * model.size / joints))
     motion = random_motion(model, samples, seed)
-    theta = in_numpy(model, model.columns, motion.q, motion.qd, motion.qdd)
+    theta = in_numpy(model, model.columns, *model.arguments(motion))
     rows = row_units(model)
     columns = column_units(model)
     scaled_theta = theta * rows[:, None] * columns
@@ -201,7 +202,7 @@ def random_motion(model: Model, samples: int, seed: int) -> Motion:
     rng = np.random.default_rng(seed)
     shape = (samples, model.robot.joints)
     units = row_units(model)
-    q = rng.uniform(-3.0, 3.0, shape) * units
+    q = reachable(model.robot, rng.uniform(-3.0, 3.0, shape) * units)
     qd = rng.uniform(-3.0, 3.0, shape) * units
     qdd = rng.uniform(-6.0, 6.0, shape) * units
     slow_samples = qd[1::2]

@@ -14,8 +14,14 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Bodies, Float, JointMatrix, Joints
-from jaxid.robot.follower_joints import all_coordinates, all_rates, on_coordinates
 from jaxid.robot.inertia import inertia_tensor
+from jaxid.robot.joint_coordinates import (
+    all_accelerations,
+    all_coordinates,
+    all_rates,
+    at_sample,
+    on_coordinates,
+)
 from jaxid.robot.robot import Robot
 
 Spatial = Float[Array, "bodies 6"]
@@ -103,7 +109,7 @@ def _relative_placements(robot: Robot, q: Joints):
     is_revolute = np.array(robot.turns)[:, None, None]
     is_turning = jnp.asarray(is_revolute, dtype)
     slides = jnp.asarray(~is_revolute, dtype)
-    angle = all_coordinates(robot.followers, q)[:, None, None]
+    angle = all_coordinates(robot, q)[:, None, None]
     if robot.virtual:
         angle = angle * _zeros_at(robot.virtual, robot, dtype)[:, None, None]
 
@@ -163,11 +169,11 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
         joints_at_rest = _zeros_at(robot.rigid, robot, dtype)[: robot.joints]
         qd = qd * joints_at_rest
         qdd = qdd * joints_at_rest
-    speeds = joints * all_rates(robot.followers, qd)[:, None]
+    speeds = joints * all_rates(robot, q, qd)[:, None]
     # Sums over all joints that move a body replace the recursion along the tree.
     v = is_moved @ speeds
     crosses = _combine(CROSS, v)
-    rates = joints * all_rates(robot.followers, qdd)[:, None]
+    rates = joints * all_accelerations(robot, q, qd, qdd)[:, None]
     rates = rates + _times(crosses, speeds)
     a = is_moved @ rates
     gravity = jnp.concatenate([jnp.zeros(3, dtype), jnp.asarray(robot.gravity, dtype)])
@@ -193,11 +199,12 @@ def spatial_forces(
     # A joint feels the wrenches of all bodies that it moves (Newton and Euler).
     moved_wrenches = jnp.asarray(moved_by(robot).T, q.dtype) @ wrenches
     joint_forces = jnp.sum(joints * moved_wrenches, axis=1)
-    return on_coordinates(robot.followers, joint_forces)
+    return on_coordinates(robot, q, joint_forces)
 
 
 def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     """Return the mass matrix of the bodies (Eq. 38)."""
+    robot, q = at_sample(robot, q)
     standstill = jnp.zeros_like(q)
     motion = ground_motion(robot, q, standstill, standstill)
     inertias = ground_inertias(p, motion.carry)
@@ -210,8 +217,8 @@ def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     lower_triangle = is_moved * products
     off_diagonal_mask = jnp.asarray(1.0 - np.eye(robot.bodies), q.dtype)
     matrix = lower_triangle + (lower_triangle * off_diagonal_mask).T
-    rows = on_coordinates(robot.followers, matrix)
-    return on_coordinates(robot.followers, rows.T).T
+    rows = on_coordinates(robot, q, matrix)
+    return on_coordinates(robot, q, rows.T).T
 
 
 def spatial_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> Array:
@@ -230,4 +237,4 @@ def spatial_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> Array
     columns = jnp.einsum("js,bsk->jbk", joints, wrenches)
     # A joint feels only the bodies that it moves.
     is_moved = jnp.asarray(moved_by(robot).T, q.dtype)
-    return on_coordinates(robot.followers, is_moved[:, :, None] * columns)
+    return on_coordinates(robot, q, is_moved[:, :, None] * columns)

@@ -16,13 +16,14 @@ from jaxid.arrays import (
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
+from jaxid.robot.joint_coordinates import reachable
 from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 
 from .coefficient_limits import JointLimits, ScaledMotion
-from .constraints import AbstractConstraint, Finding
+from .constraints import AbstractConstraint, Finding, LoopLimits
 from .criteria import AbstractCriterion, DOptimal, Information, information
 from .criteria.functions_of_eigenvalues import Scalar, Sharpness
 from .criteria.information_matrix import (
@@ -62,7 +63,7 @@ class ExcitationProblem:
             those; the robot's if None. Unknown limits are assumed as in
             `random_fourier_series`.
         criterion: Criterion to be minimised; D-optimality if None.
-        constraints: Constraints beside the limits of the joints.
+        constraints: Constraints beside the limits of the joints and of closed loops.
         noise: Standard deviation of each joint's force noise [N m or N]; 1 % of the
             largest forces if None. Its inverse weights the criterion, like the
             estimator.
@@ -100,7 +101,8 @@ class ExcitationProblem:
         self.limits = JointLimits(robot, self.basis, limits)
         self.robot = robot.replace(limits=self.limits.limits)
         self.criterion = DOptimal() if criterion is None else criterion
-        self.constraints = tuple(constraints)
+        loop_limits = (LoopLimits(),) if robot.loops else ()
+        self.constraints = (*constraints, *loop_limits)
         self.linearisations = [c.linearisation(self.robot) for c in self.constraints]
         self.samples = samples
         self.noise = assumed_noise(robot) if noise is None else np.asarray(noise, float)
@@ -249,7 +251,8 @@ class ExcitationProblem:
         """Return the information of one run, computed in NumPy."""
         coefficients = self.limits.coefficients(np.asarray(x))
         rows = self.sample_rows(self.samples)
-        motion = Motion(*(part @ coefficients.T for part in rows))
+        q, qd, qdd = (part @ coefficients.T for part in rows)
+        motion = Motion(reachable(self.robot, q), qd, qdd)
         return information(self.base, motion, self.weights, self.prior, self.sizes)
 
     def excess(self, x: ScaledMotion) -> float:

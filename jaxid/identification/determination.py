@@ -10,6 +10,7 @@ from jaxid.arrays import AnyArray, Indices, Joints, Matrix
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.result_table import Status
+from jaxid.robot.joint_coordinates import reachable
 from jaxid.robot.limits_and_drives import complete_limits
 
 from .estimators.regularisation_and_weights import Complete, Decomposition
@@ -117,7 +118,7 @@ def _random_motion(base: BaseParameters) -> Motion:
     low = np.asarray(limits.position_min)
     high = np.asarray(limits.position_max)
     pace = rng.uniform(0.0, 1.0, (SAMPLES, 1))
-    q = rng.uniform(low, high, shape)
+    q = reachable(robot, rng.uniform(low, high, shape))
     qd = pace * rng.uniform(-1.0, 1.0, shape) * np.asarray(limits.velocity)
     qdd = pace**2 * rng.uniform(-1.0, 1.0, shape) * np.asarray(limits.acceleration)
     law = base.model.memory

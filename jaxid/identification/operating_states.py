@@ -11,6 +11,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.program.sample_methods import in_numpy
 from jaxid.result_table import Summarised, Table
+from jaxid.robot.joint_coordinates import reachable
 
 from .combination import as_least_squares, combine, replace_estimates, require_same_base
 from .fit_result import Fit, interval_table
@@ -197,6 +198,7 @@ def stores_energy(base: BaseParameters) -> np.ndarray:
     shape = (2, 3, model.robot.joints)
     # Random poses show every energy; three of them exclude a coincidence.
     q, qdd = np.random.default_rng(0).uniform(-1.0, 1.0, shape)
+    q = reachable(model.robot, q)
     zeros = np.zeros_like(q)
     moving_columns = in_numpy(base, base.columns, q, zeros, qdd)
     resting_columns = in_numpy(base, base.columns, q, zeros, zeros)

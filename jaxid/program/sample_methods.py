@@ -375,3 +375,11 @@ def in_numpy(
     shapes = [x.shape for x in parameters] + [x.shape[:1] for x in columns]
     results = evaluate(program_of(owner, definition, *shapes), *parameters, *columns)
     return _samples_first(results, 1)
+
+
+def evaluate_samples(owner: eqx.Module, method: Callable, *samples: AnyArray) -> Any:
+    """Apply a method for one sample; rows of samples in NumPy need no compiler."""
+    first_samples = samples[0]
+    is_rows = isinstance(first_samples, np.ndarray) and first_samples.ndim == 2
+    evaluate = in_numpy if is_rows else on_samples
+    return evaluate(owner, method, *samples)

@@ -32,7 +32,6 @@ FREE = object()
 """
 
 _REASONS_FOR_REFUSAL = {
-    "scan": "a program has no loops, so write the loop in Python",
     "while": "a program has no loops, so write a loop of known length in Python",
     "cond": "a program has no branches, so choose between values with `jnp.where`",
     "sort": "the order would depend on the values",
@@ -404,9 +403,32 @@ def _run(
     return [read(name) for name in jaxpr.outvars]
 
 
+def _unroll(graph: Graph, equation: JaxprEqn, operands: Arrays) -> Arrays:
+    """Run a loop of known length, turn by turn."""
+    parameters = equation.params
+    turn = parameters["jaxpr"]
+    constants = parameters["num_consts"]
+    carries = constants + parameters["num_carry"]
+    carry = operands[constants:carries]
+    turns = range(parameters["length"])
+    rows: list[Arrays] = []
+    for k in reversed(turns) if parameters["reverse"] else turns:
+        slices = [np.asarray(x[k]) for x in operands[carries:]]
+        arguments = [*operands[:constants], *carry, *slices]
+        results = _run(graph, graph.label, turn.jaxpr, turn.consts, arguments)
+        carry = results[: parameters["num_carry"]]
+        rows.append(results[parameters["num_carry"] :])
+    if parameters["reverse"]:
+        rows.reverse()
+    stacks = [np.stack(entries) for entries in zip(*rows, strict=True)]
+    return [*carry, *stacks]
+
+
 def _run_equation(graph: Graph, equation: JaxprEqn, operands: Arrays) -> Arrays:
     """Run one equation: a call of another jaxpr, a move of entries, or arithmetic."""
     name = equation.primitive.name
+    if name == "scan":
+        return _unroll(graph, equation, operands)
     jaxpr = _called_jaxpr(equation)
     if jaxpr is not None:
         if isinstance(jaxpr, ClosedJaxpr):
@@ -434,8 +456,8 @@ def trace(function: Callable, *inputs: Shape | np.ndarray) -> Program:
 
     The function is ordinary JAX: arithmetic, elementwise functions, `jnp.where` and
     comparisons, sums, matrix products, and movements of entries; also `jvp`, `jacfwd`,
-    `vjp` and `linear_transpose` of these. Loops are Python loops, which the trace
-    unrolls. Constants are folded and equal expressions are merged.
+    `vjp` and `linear_transpose` of these. Loops of known length are unrolled. Constants
+    are folded and equal expressions are merged.
 
     The trace is in float64, whatever the precision of the process. Folding `0 x` to 0
     hides a NaN in x: check inputs beforehand.

@@ -26,7 +26,7 @@ def read_description(
     if has_xacro(robot):
         robot = parse_xml(path, expand_xacro(Path(path), xacro_arguments or {}))
     require_urdf(path, robot)
-    return Description(robot, GRAVITY, [], [])
+    return Description(robot, GRAVITY)
 
 
 def is_mjcf(path: str | Path) -> bool:

@@ -1,21 +1,17 @@
-r"""Joints that follow others, as in parallelograms and on belts.
+r"""Joints that follow others, as in parallelograms, on belts and in closed chains.
 
 A follower has no coordinate of its own: it moves by $q_f = k q_l + q_0$ with the joint
-that leads it. The coordinates of all joints are $\Gamma q + q_0$, where $q$ are those
-of the joints that move alone, which come first. Forces of all joints become those of
-the coordinates by $\Gamma^T$.
+that leads it, or by the loops of the robot, whose points coincide.
 """
 
 import dataclasses
 import math
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
-import jax.numpy as jnp
-import numpy as np
 
-from jaxid.arrays import AnyArray, Indices, ManyJoints, Matrix, namespace
+from jaxid.arrays import AnyArray, Float, Indices, as_finite_array, given
 from jaxid.errors import InputError
 
 MAX_FINGER_SHARE = 0.05
@@ -28,9 +24,14 @@ class Follower(eqx.Module):
     Args:
         name: Name of the joint.
         revolute: Whether it turns; a prismatic joint slides.
-        leader: Index of the joint that it follows, among those that move alone.
+        leader: Index of the joint that it follows, among those that move alone; None if
+            loops move it.
         factor: Ratio of its speed to that of its leader [1, m/rad or rad/m].
-        offset: Its coordinate where that of its leader is zero [rad or m].
+        offset: Its coordinate where that of its leader is zero, or where the robot's
+            description closes the loops [rad or m].
+        position_min: Lower end of its range, if loops move it [rad or m].
+        position_max: Upper end of its range, if loops move it [rad or m].
+        velocity: Its largest speed, if loops move it [rad/s or m/s].
 
     Raises:
         InputError: If the factor is zero, or a number is not finite.
@@ -39,9 +40,12 @@ class Follower(eqx.Module):
     name: str = eqx.field(static=True)
     _: dataclasses.KW_ONLY
     revolute: bool = eqx.field(static=True)
-    leader: int = eqx.field(static=True)
-    factor: float = eqx.field(static=True, converter=float)
+    leader: int | None = eqx.field(static=True)
+    factor: float = eqx.field(static=True, converter=float, default=1.0)
     offset: float = eqx.field(static=True, converter=float, default=0.0)
+    position_min: float = eqx.field(static=True, converter=float, default=-math.inf)
+    position_max: float = eqx.field(static=True, converter=float, default=math.inf)
+    velocity: float = eqx.field(static=True, converter=float, default=math.inf)
 
     def __check_init__(self):
         if not 0.0 < abs(self.factor) < math.inf or not math.isfinite(self.offset):
@@ -52,41 +56,35 @@ class Follower(eqx.Module):
 
 
 Followers = tuple[Follower, ...]
-"""Followers of a robot, in the order of their bodies."""
+"""Followers of a robot, in the order of their bodies: last those that loops move."""
 
 
-def all_coordinates(followers: Followers, q: ManyJoints) -> AnyArray:
-    """Return the coordinates of all joints from those of the joints that move alone."""
-    return _joined(q, [f.factor * q[..., f.leader] + f.offset for f in followers])
+class Loop(eqx.Module):
+    """Closed loop of bodies: a point of one body always coincides with one of another.
 
+    Args:
+        name: Name of the loop.
+        bodies: Indices of the two bodies; -1 for the ground.
+        points: The point in the frame of each body [m].
 
-def all_rates(followers: Followers, qd: ManyJoints) -> AnyArray:
-    """Return the velocities or accelerations of all joints in the same way."""
-    return _joined(qd, [f.factor * qd[..., f.leader] for f in followers])
+    Raises:
+        InputError: If the bodies are the same, or a point is none.
+    """
 
+    name: str = eqx.field(static=True)
+    _: dataclasses.KW_ONLY
+    bodies: tuple[int, int] = eqx.field(static=True)
+    points: Float[AnyArray, "*geometry 2 3"] = eqx.field(converter=given)
 
-def _joined(values: AnyArray, follower_values: list):
-    """Append the values of followers along the last axis."""
-    if not follower_values:
-        return values
-    xp = namespace(values)
-    return xp.concatenate([values, xp.stack(follower_values, axis=-1)], axis=-1)
-
-
-def speed_ratios(followers: Followers, joints: int) -> Matrix:
-    r"""Return $\Gamma$: speeds of all joints (rows) by those of the coordinates."""
-    ratios = np.eye(joints + len(followers), joints)
-    for row, follower in enumerate(followers, joints):
-        ratios[row, follower.leader] = follower.factor
-    return ratios
-
-
-def on_coordinates(followers: Followers, rows: Any) -> Any:
-    r"""Return $\Gamma^T$ times rows of all joints, such as their forces."""
-    if not followers:
-        return rows
-    ratios = speed_ratios(followers, len(rows) - len(followers))
-    return jnp.tensordot(jnp.asarray(ratios.T, rows.dtype), rows, 1)
+    def __post_init__(self):
+        first_body, second_body = self.bodies
+        self.points = as_finite_array(
+            f"`points` of loop `{self.name}`", self.points, (2, 3)
+        )
+        if first_body == second_body:
+            raise InputError(
+                f"loop `{self.name}` must join two bodies, but both are {first_body}."
+            )
 
 
 def order_from_ground(parent: Indices, followers: int) -> Indices:
@@ -100,6 +98,20 @@ def order_from_ground(parent: Indices, followers: int) -> Indices:
         if body not in order and parent[body] in order:
             order.append(body)
     return tuple(order[1:])
+
+
+def chain_to_ground(parent: Indices, body: int) -> Indices:
+    """Return a body and those that carry it; -1, the ground, comes last."""
+    chain = [body]
+    while chain[-1] >= 0:
+        chain.append(parent[chain[-1]])
+    return tuple(chain)
+
+
+def bodies_in_loop(parent: Indices, bodies: tuple[int, int]) -> set[int]:
+    """Return the bodies between two bodies, which carry only one of them."""
+    first_chain, second_chain = (chain_to_ground(parent, body) for body in bodies)
+    return set(first_chain) ^ set(second_chain)
 
 
 class Relation(NamedTuple):
@@ -138,15 +150,19 @@ def relation(tree: Any, joint: Any) -> Relation:
     return Relation(None, factor, offset, is_linear)
 
 
-def loaded_followers(tree: Any, tip_chain: Sequence[Any]) -> list[Any]:
+def loaded_followers(
+    tree: Any, tip_chain: Sequence[Any], loop_joints: Sequence[Any] = ()
+) -> list[Any]:
     """Return the joints of a `UrdfTree` that follow others and move parts of the arm.
 
-    Where they move, a finger hardly changes the forces of an arm, but a link does.
+    Where they move, a finger hardly changes the forces of an arm, but a link does, and
+    so does a part of a closed loop.
 
     Args:
         tree: Tree in which all joints that mimic others are held.
         tip_chain: Elements of the joints between base and end-effector, if it was
             asked for.
+        loop_joints: Elements of the joints in closed loops.
 
     Raises:
         InputError: If such a joint follows one that is not in the tree, or does not
@@ -163,6 +179,7 @@ def loaded_followers(tree: Any, tip_chain: Sequence[Any]) -> list[Any]:
         mass = sum(tree.mass(x.find("child").get("link")) for x in branch)
         carries_chain = any(x in tree.joints for x in branch)
         leads_to_tip = joint in tip_chain and leader in tree.joints
+        leads_to_tip = leads_to_tip or joint in loop_joints
         if not (carries_chain or leads_to_tip or mass > MAX_FINGER_SHARE * total):
             continue
         fault = ""
@@ -182,8 +199,10 @@ def loaded_followers(tree: Any, tip_chain: Sequence[Any]) -> list[Any]:
     return followers
 
 
-def resolved_followers(tree: Any, joints: Sequence[Any]) -> Followers:
-    """Return how the last joints of a `UrdfTree`, which are these, follow others."""
+def resolved_followers(
+    tree: Any, joints: Sequence[Any], moved_joints: Sequence[Any]
+) -> Followers:
+    """Return how the last joints of a `UrdfTree` follow others, or loops."""
     for joint in joints:
         if joint not in tree.joints:
             raise tree.error(
@@ -192,14 +211,66 @@ def resolved_followers(tree: Any, joints: Sequence[Any]) -> Followers:
                 "choose another `tip`, or remove its `<mimic>`",
             )
     followers = []
-    for joint in tree.joints[-len(joints) :]:
-        leader, factor, offset, _ = relation(tree, joint)
-        follower = Follower(
-            joint.get("name"),
-            revolute=joint.get("type") != "prismatic",
-            leader=tree.joints.index(leader),
-            factor=factor,
-            offset=offset,
-        )
-        followers.append(follower)
+    # In the order of their bodies.
+    for joint in tree.joints:
+        relation_of_joint: dict[str, Any] = {}
+        if joint in joints:
+            leader, factor, offset, _ = relation(tree, joint)
+            relation_of_joint["leader"] = tree.joints.index(leader)
+            relation_of_joint["factor"] = factor
+            relation_of_joint["offset"] = offset
+        elif joint in moved_joints:
+            low, high = tree.range(joint)
+            relation_of_joint["leader"] = None
+            relation_of_joint["position_min"] = low
+            relation_of_joint["position_max"] = high
+            relation_of_joint["velocity"] = tree.limit(joint, "velocity", math.inf)
+        if relation_of_joint:
+            turns = joint.get("type") != "prismatic"
+            name = joint.get("name")
+            followers.append(Follower(name, revolute=turns, **relation_of_joint))
     return tuple(followers)
+
+
+def joints_of_loops(
+    tree: Any, loops: Sequence[Any], tip_chain: Sequence[Any]
+) -> list[Any]:
+    """Return the moving joints in the loops of a `UrdfTree`.
+
+    If an end-effector was asked for, they are those of loops that hold a moving link on
+    the way to it.
+    """
+    joints = []
+    for loop in loops:
+        chains = []
+        for link in loop.links:
+            joints_above = tree.joints_above(link)
+            chains.append([x for x in joints_above if x.get("type") != "fixed"])
+        first_chain, second_chain = chains
+        nearest_joints = (*first_chain[:1], *second_chain[:1])
+        if not tip_chain or any(joint in tip_chain for joint in nearest_joints):
+            joints += [x for x in first_chain if x not in second_chain]
+            joints += [x for x in second_chain if x not in first_chain]
+    return joints
+
+
+def loops_of_bodies(tree: Any, loops: Sequence[Any]) -> Iterator[Loop]:
+    """Yield the loops between different bodies of a `UrdfTree`."""
+    for loop in loops:
+        carriers = [tree.carriers.get(link) for link in loop.links]
+        if None in carriers or carriers[0].body == carriers[1].body:
+            continue
+        if loop.points is None:
+            first_link, second_link = loop.links
+            raise InputError(
+                f"the constraint `{loop.name}` between `{first_link}` and "
+                f"`{second_link}` closes a loop, and holds the attitude too: cut the "
+                "loop at a joint and close it by `<connect>`, avoid it (`tip`, "
+                "`--tip`), or remove it."
+            )
+        points = [
+            carrier.position + carrier.rotation @ point
+            for carrier, point in zip(carriers, loop.points, strict=True)
+        ]
+        bodies = (carriers[0].body, carriers[1].body)
+        yield Loop(loop.name, bodies=bodies, points=points)

@@ -10,32 +10,22 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Joints, Matrix3, Vector3
+from jaxid.arrays import Joints, Matrix3, Vector3
+from jaxid.errors import InputError
 
-from .follower_joints import all_coordinates, speed_ratios
+from .joint_coordinates import (
+    all_coordinates,
+    linear_coordinates,
+    linear_ratios,
+    placement_in_parent,
+)
 from .robot import Robot
 from .rotations import Rotations, Vectors, rotation_about
 
 
-def placement_in_parent(
-    robot: Robot,
-    body: int,
-    q: AnyArray,
-) -> tuple[Matrix3, Vector3]:
-    """Return attitude and origin [m] of a body in its parent at its joint's place."""
-    R = robot.rotation[body]
-    r = robot.offset[body]
-    axis = robot.axis[body]
-    if body in robot.virtual:
-        return R, r
-    if robot.turns[body]:
-        return R @ rotation_about(axis, q), r
-    return R, r + R @ axis * q
-
-
 def placements(robot: Robot, q: Joints) -> tuple[Rotations, Vectors]:
     """Return attitudes and origins [m] of all bodies in the frame of the ground."""
-    q = all_coordinates(robot.followers, jnp.asarray(q))
+    q = all_coordinates(robot, jnp.asarray(q))
     rotations: list[Any] = [None] * robot.bodies
     origins: list[Any] = [None] * robot.bodies
     for i in robot.order:
@@ -84,13 +74,22 @@ class TipJacobian(NamedTuple):
 
 
 def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
-    """Return placements of the end-effector in many poses, and their derivatives."""
+    """Return placements of the end-effector in many poses, and their derivatives.
+
+    Raises:
+        InputError: If the robot has closed loops.
+    """
+    if robot.loops:
+        raise InputError(
+            f"`{robot.name}` has closed loops, for which no poses of the end-effector "
+            "are searched: give coordinates of the motors."
+        )
     offset = np.asarray(robot.offset)
     rotation = np.asarray(robot.rotation)
     axis = np.asarray(robot.axis)
 
     poses = len(q)
-    q = np.asarray(all_coordinates(robot.followers, q))
+    q = np.asarray(linear_coordinates(robot.followers, q))
     R = np.broadcast_to(np.eye(3), (poses, 3, 3))
     r = np.zeros((poses, 3))
     origin, turn, slide = np.zeros((3, *q.shape, 3))
@@ -111,7 +110,7 @@ def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
     lever = position[:, None] - origin
     velocity = slide + np.cross(turn, lever)
     order = list(robot.order)
-    ratios = speed_ratios(robot.followers, robot.joints)
+    ratios = linear_ratios(robot.followers, robot.joints)
     return TipJacobian(
         attitude, position, velocity[:, order], turn[:, order], ratios[order]
     )

@@ -18,7 +18,8 @@ from jaxid.errors import InputError
 
 from .forward_kinematics import TipJacobian, tip_curvature, tip_jacobian
 from .limits_and_drives import complete_limits
-from .robot import Robot, as_rotations
+from .robot import Robot
+from .rotations import as_rotations
 
 POSE_TOLERANCE = 1e-9
 """Distance at which a pose is reached [m, and rad]."""

@@ -1,6 +1,7 @@
 """The kinematic tree of an MJCF file, which MuJoCo compiles, written as a URDF."""
 
 import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,8 +15,6 @@ from jaxid.io import import_extra
 
 from .rotations import axis_rotation, rpy_angles
 
-Loop = tuple[str, str, str]
-"""Name of a constraint that closes a loop, and the two bodies that it connects."""
 JOINT_TYPES = ("floating", "ball", "prismatic", "revolute")
 """Types of joints in MuJoCo's order."""
 PARSER_CODES = re.compile(r"\nError=\w+ ErrorID=\d+ \(\w+\)")
@@ -82,6 +81,20 @@ class Effect(NamedTuple):
     link: str
 
 
+class LinkLoop(NamedTuple):
+    """A constraint that closes a loop.
+
+    Attributes:
+        name: Name of the constraint.
+        links: The two links that it connects.
+        points: The points of these that coincide; None if it holds their attitude too.
+    """
+
+    name: str
+    links: tuple[str, str]
+    points: np.ndarray | None
+
+
 class Description(NamedTuple):
     """Contents of a robot's file.
 
@@ -90,12 +103,16 @@ class Description(NamedTuple):
         gravity: Acceleration of gravity [m/s²].
         loops: Constraints that close loops.
         effects: Effects on forces that the default model leaves out.
+        motors: Names of the joints that have an actuator.
+        poses: Coordinates of joints by their names, in the poses that the file states.
     """
 
     root: Any
     gravity: Numbers
-    loops: list[Loop]
-    effects: list[Effect]
+    loops: Sequence[LinkLoop] = ()
+    effects: Sequence[Effect] = ()
+    motors: Sequence[str] = ()
+    poses: Sequence[dict[str, float]] = ()
 
 
 def import_mujoco() -> Any:
@@ -135,7 +152,9 @@ def mjcf_as_urdf(path: str | Path) -> Description:
     if model.jnt_actgravcomp.all() or not gravity.any():
         model.body_gravcomp[:] = 0.0
     tree.add_effects()
-    return Description(tree.root, gravity, tree.loops, tree.effects)
+    return Description(
+        tree.root, gravity, tree.loops, tree.effects, tree.motors(), tree.poses()
+    )
 
 
 def body_name(model: Any, body: int) -> str:
@@ -170,7 +189,7 @@ class _Writer:
         self._links = ["world"]  # of the bodies, in MuJoCo's order
         self._joints: dict[int, Any] = {}
         self._efforts = _largest_forces(mujoco, model)
-        self.loops: list[Loop] = []
+        self.loops: list[LinkLoop] = []
         self.effects: list[Effect] = []
         name = model.names.split(b"\0")[0].decode()
         self.root: Any = E.robot(E.link(name="world"), name=name)
@@ -318,16 +337,40 @@ class _Writer:
             self._add_mimic(first_object, second_object, model.eq_data[constraint, :5])
         elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
             bodies = np.array([first_object, second_object])
+            points = model.eq_data[constraint, :6].reshape(2, 3)
             if model.eq_objtype[constraint] == self._mujoco.mjtObj.mjOBJ_SITE:
+                points = model.site_pos[bodies]
                 bodies = model.site_bodyid[bodies]
             # A mocap body is moved by a program: it is no part of the robot.
             if (model.body_mocapid[bodies] < 0).all():
                 name = self._name("equality", constraint)
-                links = [self._links[body] for body in bodies]
-                self.loops.append((name, *links))
+                links = (self._links[bodies[0]], self._links[bodies[1]])
+                is_point = kind == kinds.mjEQ_CONNECT
+                loop = LinkLoop(name, links, points.copy() if is_point else None)
+                self.loops.append(loop)
         elif kind == kinds.mjEQ_TENDON:
             name = self._name("equality", constraint)
             self.effects.append(Effect("constraint", name, "a relation of tendons", ""))
+
+    def motors(self) -> list[str]:
+        """Return the names of the joints that an actuator drives."""
+        model = self._model
+        actuators = range(model.nu)
+        return [
+            self._name("joint", model.actuator_trnid[actuator, 0])
+            for actuator in actuators
+            if _acts_on_joint(self._mujoco, model, actuator)
+        ]
+
+    def poses(self) -> list[dict[str, float]]:
+        """Return the coordinates of the joints in the keyframes, then in the pose."""
+        model = self._model
+        names = [element.get("name") for element in self._joints.values()]
+        places = model.jnt_qposadr[list(self._joints)]
+        return [
+            dict(zip(names, positions[places].tolist(), strict=True))
+            for positions in (*model.key_qpos, model.qpos0)
+        ]
 
     def add_effects(self):
         """Enter the effects of joints, tendons, bodies and the medium around them."""

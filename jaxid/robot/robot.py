@@ -9,7 +9,10 @@ import numpy as np
 from jaxid.arrays import (
     AnyArray,
     Float,
+    Hashable,
+    Indices,
     Joints,
+    ManyJoints,
     Matrix3,
     Numbers,
     Vector3,
@@ -20,16 +23,23 @@ from jaxid.arrays import (
 from jaxid.errors import InputError
 from jaxid.result_table import Column, Remark, Status, Summarised, Table
 
-from .follower_joints import Followers, order_from_ground
+from .follower_joints import Followers, Loop, order_from_ground
 from .inertia import IMPOSSIBLE, Tool
+from .joint_coordinates import close_loops
 from .limits_and_drives import MAX_LENGTH, Drives, Limits, length_notes, limit_notes
-from .rotations import SNAP_TOLERANCE, snapped, snapped_rotations
+from .rotations import (
+    SNAP_TOLERANCE,
+    as_rotations,
+    snapped,
+    snapped_rotations,
+    unit_axes,
+)
 from .virtual_joints import GROUP, numbers_of_bodies, with_sensor
 
 GRAVITY = (0.0, 0.0, -9.81)
 
 
-class Robot(Summarised, eqx.Module):
+class Robot(Summarised, Hashable):
     r"""An open kinematic chain or tree: joint $i$ moves body $i$ against its parent.
 
     Bodies of joints that follow others come last, after those of all joints that move
@@ -50,7 +60,12 @@ class Robot(Summarised, eqx.Module):
             body's axes.
         offset: Origins of the bodies in their parents at $q = 0$ [m].
         parent: Indices of the parent bodies, -1 for the ground; a serial chain if None.
-        followers: Joints that follow others.
+        followers: Joints that follow others, or that loops move; these come last.
+        loops: Pairs of points that coincide; `with_loops` gives them to a robot.
+        loop_rows: Entries of the distances between these points that close the loops,
+            as many as joints that loops move.
+        loop_pose: Coordinates of all joints at which the description closes the loops.
+        coordinates: Those at the sample for which it is evaluated (`at_sample`).
         joint_names: Names of the joints; `joint1`, `joint2`, … if None.
         gravity: Acceleration of gravity in the frame of the ground [m/s²].
         limits: Joint limits; infinite if None.
@@ -78,6 +93,10 @@ class Robot(Summarised, eqx.Module):
     joint_names: tuple[str, ...] = eqx.field(static=True, converter=given, default=None)
     parent: tuple[int, ...] = eqx.field(static=True, converter=given, default=None)
     followers: Followers = ()
+    loops: tuple[Loop, ...] = ()
+    loop_rows: Indices = eqx.field(static=True, default=())
+    loop_pose: Float[AnyArray, " bodies"] | None = None
+    coordinates: Float[AnyArray, " bodies"] | None = None
     revolute: tuple[bool, ...] = eqx.field(static=True)
     axis: Float[AnyArray, "*geometry bodies 3"] = eqx.field(converter=given)
     rotation: Float[AnyArray, "*geometry bodies 3 3"] = eqx.field(converter=given)
@@ -110,7 +129,7 @@ class Robot(Summarised, eqx.Module):
         self.parent = tuple(int(body) for body in self.parent)
         self.revolute = tuple(bool(turns) for turns in self.revolute)
         # Arrays of JAX may have leading axes, for batches of geometries.
-        self.axis = _unit_axes(as_finite_array("`axis`", self.axis, (n, 3)))
+        self.axis = unit_axes(as_finite_array("`axis`", self.axis, (n, 3)))
         self.rotation = as_rotations("`rotation`", self.rotation, (n, 3, 3))
         self.offset = as_finite_array("`offset`", self.offset, (n, 3))
         self.gravity = as_finite_array("`gravity`", self.gravity, (3,))
@@ -154,7 +173,7 @@ class Robot(Summarised, eqx.Module):
                     f"the name {name!r} must be printable: remove all other characters."
                 )
         for follower in self.followers:
-            if not 0 <= follower.leader < n:
+            if follower.leader is not None and not 0 <= follower.leader < n:
                 raise InputError(
                     f"`leader` of `{follower.name}` must be a joint that moves alone, "
                     f"from 0 to {n - 1}, but is {follower.leader}."
@@ -270,6 +289,20 @@ class Robot(Summarised, eqx.Module):
             parent_chain = chains[parent] if parent >= 0 else ()
             chains[body] = (*parent_chain, body)
         return tuple(chains)
+
+    def close(self, q: Numbers) -> ManyJoints:
+        """Return the coordinates of all joints; those of loops are on one branch.
+
+        It is the branch of `loop_pose`. Where JAX traces, coordinates at which the
+        loops do not close become NaN.
+
+        Args:
+            q: Coordinates of the joints that move alone [rad or m].
+
+        Raises:
+            InputError: If the loops do not close at some sample.
+        """
+        return close_loops(self, q)
 
     @property
     def known_max_forces(self) -> Joints:
@@ -457,30 +490,3 @@ class Robot(Summarised, eqx.Module):
             facts=facts,
             remarks=self.remarks,
         )
-
-
-def _unit_axes(axes: AnyArray):
-    """Return axes of length one; arrays of JAX are taken as they are."""
-    if not isinstance(axes, np.ndarray):
-        return axes
-    length = np.linalg.norm(axes, axis=-1, keepdims=True)
-    if (length < 1e-9).any():
-        joint = int(length.argmin()) + 1
-        raise InputError(
-            f"`axis` of joint {joint} is the zero vector: give it a direction."
-        )
-    # A unit vector keeps its digits.
-    return np.where(np.abs(length - 1.0) > 1e-15, axes / length, axes)
-
-
-def as_rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
-    """Return a copy as rotation matrices; a JAX array is taken as it is."""
-    R = as_finite_array(name, value, shape)
-    if isinstance(R, np.ndarray):
-        products = np.swapaxes(R, -1, -2) @ R
-        is_orthonormal = np.abs(products - np.eye(3)).max() < 1e-6
-        if not is_orthonormal or (np.linalg.det(R) < 0).any():
-            raise InputError(
-                f"{name} must hold orthonormal, right-handed rotation matrices."
-            )
-    return R

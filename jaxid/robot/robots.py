@@ -1,6 +1,6 @@
-"""The library of robots, followers, and parameters that files of robots claim."""
+"""The library of robots, followers, loops, and parameters that files claim."""
 
-from .follower_joints import Follower as Follower
+from .follower_joints import Follower as Follower, Loop as Loop
 from .library import (
     iiwa14 as iiwa14,
     kr300 as kr300,
@@ -12,4 +12,5 @@ from .library import (
     ur10 as ur10,
     ur10e as ur10e,
 )
+from .loop_assembly import with_loops as with_loops
 from .urdf import urdf_parameters as urdf_parameters

@@ -11,7 +11,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Matrix3, Numbers, Vector3, namespace
+from jaxid.arrays import (
+    AnyArray,
+    Float,
+    Matrix3,
+    Numbers,
+    Vector3,
+    as_finite_array,
+    namespace,
+)
 from jaxid.errors import InputError
 
 Vectors = Float[AnyArray, "*batch 3"]
@@ -120,3 +128,30 @@ class Placement(NamedTuple):
         """Return the placement on the body of what is placed on the link."""
         body, R, r = self
         return Placement(body, without_rounding(R @ rotation), r + R @ position)
+
+
+def unit_axes(axes: AnyArray):
+    """Return axes of length one; arrays of JAX are taken as they are."""
+    if not isinstance(axes, np.ndarray):
+        return axes
+    length = np.linalg.norm(axes, axis=-1, keepdims=True)
+    if (length < 1e-9).any():
+        joint = int(length.argmin()) + 1
+        raise InputError(
+            f"`axis` of joint {joint} is the zero vector: give it a direction."
+        )
+    # A unit vector keeps its digits.
+    return np.where(np.abs(length - 1.0) > 1e-15, axes / length, axes)
+
+
+def as_rotations(name: str, value: Numbers, shape: tuple[int, ...]) -> AnyArray:
+    """Return a copy as rotation matrices; a JAX array is taken as it is."""
+    R = as_finite_array(name, value, shape)
+    if isinstance(R, np.ndarray):
+        products = np.swapaxes(R, -1, -2) @ R
+        is_orthonormal = np.abs(products - np.eye(3)).max() < 1e-6
+        if not is_orthonormal or (np.linalg.det(R) < 0).any():
+            raise InputError(
+                f"{name} must hold orthonormal, right-handed rotation matrices."
+            )
+    return R

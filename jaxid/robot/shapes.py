@@ -24,8 +24,7 @@ from jaxid.arrays import (
 )
 from jaxid.errors import InputError
 
-from .robot import as_rotations
-from .rotations import Vectors
+from .rotations import Vectors, as_rotations
 
 GROUND = -1
 """Index of the ground among the bodies."""

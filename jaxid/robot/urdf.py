@@ -9,8 +9,9 @@ import numpy as np
 from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 
-from .follower_joints import Followers, all_coordinates, speed_ratios
+from .follower_joints import Followers
 from .inertia import IMPOSSIBLE, MAX_DENSITY, ball_densities
+from .joint_coordinates import linear_coordinates, linear_ratios
 from .limits_and_drives import (
     MAX_STATED_ANGLE,
     MAX_STATED_LENGTH,
@@ -19,6 +20,7 @@ from .limits_and_drives import (
     owners,
     range_fault,
 )
+from .loop_assembly import assembled
 from .robot import Robot
 from .urdf_elements import ORIGIN
 from .urdf_tree import TURNING_TYPES, UrdfTree
@@ -113,6 +115,7 @@ def load_urdf(
             parent=tuple(placement.body for placement in tree.placements),
             revolute=tuple(joint.get("type") in TURNING_TYPES for joint in joints),
             followers=tree.followers,
+            loops=tree.loops,
             axis=tree.axes,
             rotation=[placement.rotation for placement in tree.placements],
             offset=[placement.position for placement in tree.placements],
@@ -131,9 +134,14 @@ def load_urdf(
             virtual=tuple(range(GROUP)) if floating else (),
             floating=floating,
         )
+        robot = robot.mounted(base_rotation, base_position)
+        if not tree.loops:
+            return robot
+        names = robot.body_names
+        poses = [np.array([pose[x] for x in names]) for pose in tree.poses]
+        return assembled(robot, poses)
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
-    return robot.mounted(base_rotation, base_position)
 
 
 load_mjcf = load_urdf
@@ -215,12 +223,12 @@ def _of_leaders(followers: Followers, parameters: dict[str, Any]) -> dict[str, A
     # What is negative is not used.
     for key in ("armature", "damping", "friction", "stiffness"):
         parameters[key] = np.maximum(parameters[key], 0.0)
-    ratios = speed_ratios(followers, joints).T
+    ratios = linear_ratios(followers, joints).T
     squares = ratios**2
     sums = {key: squares @ values for key, values in parameters.items()}
     sums["friction"] = np.abs(ratios) @ parameters["friction"]
     # The springs of all joints are one spring, which rests where their forces cancel.
-    positions = all_coordinates(followers, np.zeros(joints))
+    positions = linear_coordinates(followers, np.zeros(joints))
     deflections = positions - parameters["springref"]
     spring_forces = parameters["stiffness"] * deflections
     has_spring = sums["stiffness"] > 0.0
@@ -279,6 +287,8 @@ def _limit_by_followers(
     joints = tree.joints[len(low) :]
     for joint, follower in zip(joints, tree.followers, strict=True):
         leader = follower.leader
+        if leader is None:
+            continue
         follower_ends = np.array(_checked_range(tree, joint))
         ends = np.sort((follower_ends - follower.offset) / follower.factor)
         low[leader] = max(low[leader], ends[0])
@@ -371,6 +381,12 @@ def _follower_notes(tree: UrdfTree):
     """Return notes on joints that follow others and move bodies of the robot."""
     first_number = len(_leading_joints(tree)) + 1
     for number, follower in enumerate(tree.followers, first_number):
+        if follower.leader is None:
+            yield (
+                f"joint `{follower.name}`: closed loops move it, as its motors "
+                f"stand; its body has the number {number} (`m{number}`)."
+            )
+            continue
         leader_name = tree.joints[follower.leader].get("name")
         yield (
             f"joint `{follower.name}`: follows another one, at {follower.factor:.4g} * "

@@ -1,7 +1,7 @@
 """Links and joints of URDF, xacro and MJCF files, merged into the bodies of a robot."""
 
 import copy
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,10 +12,16 @@ from jaxid.arrays import Matrix3, Vector3
 from jaxid.errors import InputError
 
 from .description_files import is_mjcf, read_description
-from .follower_joints import Followers, loaded_followers, relation, resolved_followers
+from .follower_joints import (
+    Followers,
+    joints_of_loops,
+    loaded_followers,
+    loops_of_bodies,
+    relation,
+    resolved_followers,
+)
 from .inertia import BodyParameters, Inertia
 from .limits_and_drives import MAX_LINK_LENGTH, are_degrees, listed
-from .mjcf import Loop
 from .rotations import Placement, axis_rotation, without_rounding
 from .urdf_elements import ORIGIN, UrdfElements
 from .virtual_joints import GROUP, virtual_elements
@@ -43,7 +49,9 @@ class UrdfTree(UrdfElements):
         carriers: For each link its placement on the body that carries it.
         named_joints: Elements of all joints, by name.
         joints: Elements of the moving joints; those that follow others come last.
-        followers: How these follow others.
+        followers: How these follow others, or that loops move them.
+        loops: Points of bodies that coincide.
+        poses: Coordinates of joints by their names, in the poses that the file states.
         axes: Axes of the moving joints.
         placements: Placements of the bodies that they move, on the bodies that carry
             them.
@@ -69,7 +77,7 @@ class UrdfTree(UrdfElements):
         self.path = str(path)
         self.floating = floating
         description = read_description(path, xacro_arguments)
-        self.root, self.gravity, loops, effects = description
+        self.root, self.gravity, loops, effects, motors, self.poses = description
         self.compiled = is_mjcf(path)
         name = self.root.get("name") or Path(path).stem
         self.name = "".join(c if c.isprintable() else " " for c in name)
@@ -96,13 +104,16 @@ class UrdfTree(UrdfElements):
         self._merge(base or root, tip)
         # The bodies tell which followers move more than a finger.
         tip_chain = self._chain(base or root, tip or base or root)
-        followers = loaded_followers(self, tip_chain)
-        if followers:
-            self._merge(base or root, tip, followers)
-            self._put_last(followers)
-        self._refuse_loops(loops)
+        loop_joints = joints_of_loops(self, loops, tip_chain)
+        followers = loaded_followers(self, tip_chain, loop_joints)
+        joints = [*followers, *loop_joints]
+        if joints:
+            self._merge(base or root, tip, joints)
+            alone = (*followers, *(self.named_joints[name] for name in motors))
+            self._put_last(followers, [x for x in loop_joints if x not in alone])
+        self.loops = tuple(loops_of_bodies(self, loops))
         links = ("", *self.moving_links)
-        self.effects = [effect for effect in effects if effect.link in links]
+        self.effects = [x for x in effects if x.link in links]
 
     def _float(self, base: str | None):
         """Put the base on virtual joints; return the link that carries them."""
@@ -259,10 +270,12 @@ class UrdfTree(UrdfElements):
         self.axes.append(self._axis(joint))
         self.placements.append(placement)
 
-    def _put_last(self, followers: Sequence[Any]):
-        """Put the bodies of followers behind those of the joints that they follow."""
-        is_follower = [joint in followers for joint in self.joints]
-        order = np.argsort(is_follower, kind="stable").tolist()
+    def _put_last(self, followers: Sequence[Any], moved_joints: Sequence[Any]):
+        """Put the bodies of followers last, behind them those that loops move."""
+        places = [
+            (joint in followers) + 2 * (joint in moved_joints) for joint in self.joints
+        ]
+        order = np.argsort(places, kind="stable").tolist()
         numbers = {body: place for place, body in enumerate(order)}
         numbers[-1] = -1
         self.joints = [self.joints[body] for body in order]
@@ -271,7 +284,7 @@ class UrdfTree(UrdfElements):
         self.placements = [placement.renumbered(numbers) for placement in placements]
         for link, carrier in self.carriers.items():
             self.carriers[link] = carrier.renumbered(numbers)
-        self.followers = resolved_followers(self, followers)
+        self.followers = resolved_followers(self, followers, moved_joints)
 
     def placed_links(self) -> dict[str, Placement]:
         """Return `carriers`, and links on joints that the chain leaves out."""
@@ -285,17 +298,13 @@ class UrdfTree(UrdfElements):
                     links.append(child)
         return placements
 
-    def _refuse_loops(self, loops: Iterable[Loop]):
-        """Reject constraints that close a loop between bodies of the robot."""
-        for name, first_link, second_link in loops:
-            if first_link not in self.carriers or second_link not in self.carriers:
-                continue
-            if self.carriers[first_link].body != self.carriers[second_link].body:
-                raise InputError(
-                    f"`{self.path}`: the constraint `{name}` "
-                    f"between `{first_link}` and `{second_link}` closes a loop: "
-                    "avoid it (`tip`, `--tip`), or remove it."
-                )
+    def joints_above(self, link: str):
+        """Return the joints between a link and the root."""
+        joints = []
+        while link in self._above:
+            joints.append(self._above[link])
+            link, _ = link_names(self._above[link])
+        return joints
 
     @property
     def moving_links(self) -> list[str]:

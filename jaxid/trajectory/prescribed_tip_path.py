@@ -11,7 +11,8 @@ import numpy as np
 from jaxid.arrays import AnyArray, Matrix3, Numbers, Vector3, as_finite_array
 from jaxid.errors import InputError
 from jaxid.robot.inverse_kinematics import inverse_kinematics_along
-from jaxid.robot.robot import Robot, as_rotations
+from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import as_rotations
 
 from .spline import (
     DEGREE,

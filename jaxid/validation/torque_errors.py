@@ -22,6 +22,7 @@ from jaxid.result_table import (
     Table,
     percent,
 )
+from jaxid.robot.joint_coordinates import reachable
 
 POSES = 2000
 """Random poses in which the mass matrix is evaluated."""
@@ -405,6 +406,7 @@ def definiteness(fit: Fit, poses: int = POSES) -> Definiteness:
     q = np.random.default_rng(0).uniform(
         lower_limits, upper_limits, (poses, robot.joints)
     )
+    q = reachable(robot, q)
     M = in_numpy(fit.base, fit.base.inertia, q, shared=(fit.parameters,))
     min_eigenvalues = np.linalg.eigvalsh(M)[:, 0]
     worst_pose = int(np.argmin(min_eigenvalues))

@@ -98,7 +98,6 @@ def test_constants_of_an_input_are_folded():
 @pytest.mark.parametrize(
     ("function", "word"),
     [
-        (lambda x: jax.lax.fori_loop(0, 3, lambda _, c: c * x[0], 1.0), "scan"),
         (
             lambda x: jax.lax.while_loop(lambda c: c < 3, lambda c: c + x[0], 0.0),
             "while",
@@ -115,6 +114,15 @@ def test_constants_of_an_input_are_folded():
 def test_what_a_program_cannot_do_is_refused_by_name(function, word):
     with pytest.raises(ValueError, match=rf"`trace` cannot translate .*{word}"):
         trace(function, (3,))
+
+
+def test_loops_of_known_length_are_unrolled():
+    def sums(x):
+        return jax.lax.scan(lambda c, y: (c * x[0] + y, c), 1.0, x, reverse=True)
+
+    x = np.array([0.5, 2.0, 3.0])
+    for ours, expected in zip(evaluate(trace(sums, (3,)), x), sums(x), strict=True):
+        np.testing.assert_allclose(ours, expected, rtol=1e-15)
 
 
 def test_a_traced_value_in_the_closure_is_refused():

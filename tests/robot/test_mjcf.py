@@ -197,7 +197,7 @@ REFUSED = {
             "<equality>",
             '<equality><connect body1="ram" body2="table" anchor="0 0 0"/>',
         ),
-        "`equality0` between `ram` and `table` closes a loop",
+        "have 0 freedom.s., but 2 motor.s., at `pan`, `slide`",
     ),
     "a mesh that is missing": (
         ARM.replace("<default>", '<asset><mesh file="no.stl"/></asset><default>', 1),

@@ -5,13 +5,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray
+from jaxid.program.sample_methods import evaluate_samples
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot
 
 from .constraint import (
     AbstractConstraint,
     Finding,
-    evaluate_samples,
     in_blocks,
     pull_back_samples,
 )

@@ -3,7 +3,7 @@
 import math
 from abc import abstractmethod
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
@@ -13,7 +13,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, Int
 from jaxid.dynamics.motion import Motion
 from jaxid.program.gradient import pull_back
-from jaxid.program.sample_methods import in_numpy, on_samples, program_of
+from jaxid.program.sample_methods import program_of
 from jaxid.robot.robot import Robot
 
 Excess = Float[AnyArray, "*batch values"]
@@ -163,14 +163,6 @@ def in_blocks(function: Callable, *arrays: AnyArray) -> list[np.ndarray]:
     results = [function(*(array[rows] for array in arrays)) for rows in places]
     parts_of_results = zip(*results, strict=True)
     return [np.concatenate(parts)[:samples] for parts in parts_of_results]
-
-
-def evaluate_samples(owner: eqx.Module, method: Callable, *samples: AnyArray) -> Any:
-    """Apply a method for one sample; rows of samples in NumPy need no compiler."""
-    first_samples = samples[0]
-    is_rows = isinstance(first_samples, np.ndarray) and first_samples.ndim == 2
-    evaluate = in_numpy if is_rows else on_samples
-    return evaluate(owner, method, *samples)
 
 
 def pull_back_samples(

@@ -13,6 +13,7 @@ from jaxid.dynamics.model import Coordinates
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import AbstractTransition, Reversal
 from jaxid.errors import InputError
+from jaxid.program.sample_methods import evaluate_samples
 from jaxid.robot.limits_and_drives import complete_limits
 from jaxid.robot.robot import Robot
 
@@ -20,7 +21,6 @@ from .constraint import (
     AbstractConstraint,
     Finding,
     ValuesAndSlopes,
-    evaluate_samples,
     pull_back_samples,
 )
 

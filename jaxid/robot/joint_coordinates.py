@@ -1,0 +1,401 @@
+r"""Coordinates, rates and forces of all joints, from the joints that move alone.
+
+With $y$ the coordinates of the joints that move alone, those of all joints are $q(y)$:
+followers of others by $k y_l + q_0$, the joints of closed loops by $g(q) = 0$, where
+$g$ are the distances between the points that coincide. Speeds are $\Gamma \dot y$ with
+$\Gamma = \partial q / \partial y$, accelerations $\Gamma \ddot y + \dot\Gamma \dot y$,
+and forces of all joints become those of $y$ by $\Gamma^T$. Functions are for one sample
+and take either $y$ or the coordinates of all joints (`Robot.close`), which saves them
+closing the loops.
+"""
+
+import functools
+import itertools
+from typing import Any
+
+import equinox as eqx
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    Joints,
+    ManyJoints,
+    Matrix,
+    Matrix3,
+    Numbers,
+    Vector3,
+    as_array,
+    is_traced,
+    namespace,
+)
+from jaxid.errors import InputError
+from jaxid.program.sample_methods import evaluate_samples
+
+from .follower_joints import Followers, Loop, chain_to_ground
+from .rotations import rotation_about
+
+APPROACH = 0.8
+"""Factor of the distance from the robot's `loop_pose` in one step towards it."""
+MAX_APPROACHES = 40
+"""Steps in which random coordinates come near enough to this pose."""
+
+
+STEPS = 10
+"""Newton's steps that close the loops, from the robot's `loop_pose`."""
+MAX_CHANGE = 0.5
+"""Largest change of a joint in one of these steps [rad or m]."""
+MAX_GAP = {"float64": 1e-9, "float32": 1e-4}
+"""Distance between two points of a loop up to which it is closed, by precision [m]."""
+MIN_CLOSING_SHARE = 1e-4
+"""Determinant of closing relative to that of the description; below, it is singular."""
+MIN_SAFE_SHARE = 0.2
+"""The same for motions that are designed or drawn."""
+SMALLEST_SQUARE = 1e-24
+"""Added to squares of columns [m²]: at a singular pose, steps are large but finite."""
+
+
+def placement_in_parent(
+    robot: Any,
+    body: int,
+    q: AnyArray,
+) -> tuple[Matrix3, Vector3]:
+    """Return attitude and origin [m] of a body in its parent at its joint's place."""
+    R = robot.rotation[body]
+    r = robot.offset[body]
+    axis = robot.axis[body]
+    if body in robot.virtual:
+        return R, r
+    if robot.turns[body]:
+        return R @ rotation_about(axis, q), r
+    return R, r + R @ axis * q
+
+
+def linear_ratios(followers: Followers, joints: int) -> Matrix:
+    r"""Return $\Gamma$ of joints that move alone and of those that follow them."""
+    led_followers = with_leader(followers)
+    ratios = np.eye(joints + len(led_followers), joints)
+    for row, follower in enumerate(led_followers, joints):
+        ratios[row, follower.leader] = follower.factor
+    return ratios
+
+
+def with_leader(followers: Followers) -> Followers:
+    """Return the followers that another joint leads, not loops."""
+    return tuple(f for f in followers if f.leader is not None)
+
+
+def linear_coordinates(followers: Followers, q: ManyJoints) -> AnyArray:
+    """Return the coordinates of all joints but those that loops move."""
+    return _joined(
+        q, [f.factor * q[..., f.leader] + f.offset for f in with_leader(followers)]
+    )
+
+
+def _linear_rates(followers: Followers, qd: ManyJoints) -> AnyArray:
+    """Return the velocities or accelerations of these joints."""
+    return _joined(qd, [f.factor * qd[..., f.leader] for f in with_leader(followers)])
+
+
+def _joined(values: AnyArray, follower_values: list):
+    """Append the values of followers along the last axis."""
+    if not follower_values:
+        return values
+    xp = namespace(values)
+    return xp.concatenate([values, xp.stack(follower_values, axis=-1)], axis=-1)
+
+
+def at_sample(robot: Any, q: Joints) -> tuple[Any, Joints]:
+    """Return a robot with loops with the `coordinates` of one sample, and `q`.
+
+    Args:
+        robot: Robot, which stays as it is if it has no loops.
+        q: Coordinates of the joints that move alone, which are returned, or those of
+            all joints (`Robot.close`).
+    """
+    is_closed = robot.coordinates is not None and len(q) == robot.joints
+    if not robot.loops or is_closed:
+        return robot, q
+    coordinates = q if len(q) == robot.bodies else closed_coordinates(robot, q)
+    place = (lambda robot: robot.coordinates, robot, coordinates)
+    robot = eqx.tree_at(*place, is_leaf=lambda x: x is None)
+    return robot, coordinates[: robot.joints]
+
+
+def all_coordinates(robot: Any, q: Joints) -> AnyArray:
+    """Return the coordinates of all joints."""
+    robot, q = at_sample(robot, q)
+    if robot.loops:
+        return robot.coordinates
+    return linear_coordinates(robot.followers, q)
+
+
+def all_rates(robot: Any, q: Joints, qd: Joints) -> AnyArray:
+    r"""Return the velocities of all joints, $\Gamma \dot y$."""
+    rates = _linear_rates(robot.followers, qd)
+    if not robot.loops:
+        return rates
+    return jnp.concatenate([rates, _loop_ratios(robot, q) @ qd])
+
+
+def all_accelerations(robot: Any, q: Joints, qd: Joints, qdd: Joints) -> AnyArray:
+    r"""Return the accelerations of all joints, $\Gamma \ddot y + \dot\Gamma \dot y$."""
+    accelerations = _linear_rates(robot.followers, qdd)
+    if not robot.loops:
+        return accelerations
+    coordinates = all_coordinates(robot, q)
+    rates = all_rates(robot, q, qd)
+
+    def gap_rates(coordinates):
+        gaps = functools.partial(closing_rows, robot)
+        return jax.jvp(gaps, (coordinates,), (rates,))[1]
+
+    _, gap_accelerations = jax.jvp(gap_rates, (coordinates,), (rates,))
+    _, slopes = gap_slopes(robot, coordinates)
+    bias = solve_columns(slopes, -gap_accelerations)
+    return jnp.concatenate([accelerations, _loop_ratios(robot, q) @ qdd + bias])
+
+
+def speed_ratios(robot: Any, q: Joints) -> AnyArray:
+    r"""Return $\Gamma$: speeds of all joints (rows) by those of the coordinates."""
+    ratios = linear_ratios(robot.followers, robot.joints)
+    if not robot.loops:
+        return ratios
+    return jnp.concatenate([ratios, _loop_ratios(robot, q)])
+
+
+def on_coordinates(robot: Any, q: Joints, rows: Any) -> Any:
+    r"""Return $\Gamma^T$ times rows of all joints, such as their forces."""
+    if not robot.followers:
+        return rows
+    ratios = jnp.asarray(speed_ratios(robot, q), rows.dtype)
+    return jnp.tensordot(ratios.T, rows, 1)
+
+
+def _loop_ratios(robot: Any, q: Joints):
+    """Return the speeds of the joints that loops move by those of the coordinates."""
+    free_slopes, slopes = gap_slopes(robot, all_coordinates(robot, q))
+    ratios = linear_ratios(robot.followers, robot.joints)
+    return solve_columns(slopes, -free_slopes @ ratios)
+
+
+def loop_gaps(robot: Any, coordinates: Joints) -> Array:
+    """Return the vectors between the points of each loop, one after the other [m].
+
+    Each is in the frame of the nearest body that carries both points: only the joints
+    of the loop move it, and the loop of a plane stays in its plane.
+    """
+    gaps = []
+    for loop in robot.loops:
+        carrier = _common_body(robot, loop)
+        first_point, second_point = (
+            _place_on(robot, coordinates, body, point, carrier)
+            for body, point in zip(loop.bodies, loop.points, strict=True)
+        )
+        gaps.append(second_point - first_point)
+    return jnp.concatenate(gaps)
+
+
+def closing_rows(robot: Any, coordinates: Joints) -> Array:
+    """Return the independent entries of the gaps: as many as joints that loops move."""
+    return loop_gaps(robot, coordinates)[np.array(robot.loop_rows, int)]
+
+
+def gap_slopes(robot: Any, coordinates: Joints) -> tuple[Array, Array]:
+    """Return the slopes of `closing_rows` by other joints, and by those of loops."""
+    slopes = jax.jacfwd(functools.partial(closing_rows, robot))(coordinates)
+    other_joints = robot.bodies - len(robot.loop_rows)
+    return slopes[:, :other_joints], slopes[:, other_joints:]
+
+
+def _common_body(robot: Any, loop: Loop):
+    """Return the nearest body that carries both bodies of a loop; -1 is the ground."""
+    first_body, second_body = loop.bodies
+    second_chain = chain_to_ground(robot.parent, second_body)
+    first_chain = chain_to_ground(robot.parent, first_body)
+    return next(body for body in first_chain if body in second_chain)
+
+
+def _place_on(robot: Any, coordinates: Joints, body: int, point: Vector3, carrier: int):
+    """Return a point of a body in the frame of a body that carries it."""
+    while body != carrier:
+        R, r = placement_in_parent(robot, body, coordinates[body])
+        point = r + R @ point
+        body = robot.parent[body]
+    return point
+
+
+@jax.custom_jvp
+def closed_coordinates(robot: Any, q: Joints) -> Array:
+    """Return the coordinates of all joints, at which the loops are closed.
+
+    Where no loops close, or on another branch, they are not: see `loop_closure`.
+    """
+    other_coordinates = linear_coordinates(robot.followers, q)
+    joints = len(robot.loop_rows)
+    start = jnp.asarray(robot.loop_pose[-joints:], q.dtype)
+
+    def step(_, loop_coordinates):
+        coordinates = jnp.concatenate([other_coordinates, loop_coordinates])
+        _, slopes = gap_slopes(robot, coordinates)
+        change = solve_columns(slopes, -closing_rows(robot, coordinates))
+        change = jnp.minimum(jnp.maximum(change, -MAX_CHANGE), MAX_CHANGE)
+        return loop_coordinates + change
+
+    loop_coordinates = jax.lax.fori_loop(0, STEPS, step, start)
+    return jnp.concatenate([other_coordinates, loop_coordinates])
+
+
+@closed_coordinates.defjvp
+def _closed_rates(primals: tuple, tangents: tuple):
+    """Return the coordinates and their rates, by the implicit function theorem."""
+    robot, _ = primals
+    coordinates = closed_coordinates(*primals)
+    joints = len(robot.loop_rows)
+    loop_coordinates = coordinates[-joints:]
+
+    def open_loops(robot, q):
+        other_coordinates = linear_coordinates(robot.followers, q)
+        open_coordinates = jnp.concatenate([other_coordinates, loop_coordinates])
+        return closing_rows(robot, open_coordinates), other_coordinates
+
+    _, (gap_rates, other_rates) = jax.jvp(open_loops, primals, tangents)
+    _, slopes = gap_slopes(robot, coordinates)
+    loop_rates = solve_columns(slopes, -gap_rates)
+    return coordinates, jnp.concatenate([other_rates, loop_rates])
+
+
+def solve_columns(A: Array, b: Array) -> Array:
+    """Solve $A x = b$ by orthogonal columns, without square roots or pivoting.
+
+    A program has no loops, and no order of rows that is good in all poses.
+    """
+    n = len(A)
+    columns = [A[:, j] for j in range(n)]
+    squares = []
+    products = {}
+    solution = []
+    for i in range(n):
+        square = columns[i] @ columns[i] + SMALLEST_SQUARE
+        squares.append(square)
+        for j in range(i + 1, n):
+            products[i, j] = columns[i] @ columns[j] / square
+            columns[j] = columns[j] - products[i, j] * columns[i]
+        share = jnp.tensordot(columns[i], b, 1) / square
+        solution.append(share)
+        b = b - jnp.tensordot(columns[i], share, 0)
+    for i in reversed(range(n)):
+        for j in range(i + 1, n):
+            solution[i] = solution[i] - products[i, j] * solution[j]
+    return jnp.stack(solution)
+
+
+def determinant(A: Array) -> Array:
+    """Return a determinant by minors of the first rows, row by row.
+
+    Without divisions: it changes its sign smoothly. Zeros cost nothing in a program.
+    """
+    n = len(A)
+    minors: dict[tuple[int, ...], Any] = {(): jnp.ones((), A.dtype)}
+    for row in range(n):
+        larger_minors = {}
+        for columns in itertools.combinations(range(n), row + 1):
+            total = 0.0
+            for place, column in enumerate(columns):
+                remaining_columns = columns[:place] + columns[place + 1 :]
+                sign = (-1.0) ** (row - place)
+                total = total + sign * A[row, column] * minors[remaining_columns]
+            larger_minors[columns] = total
+        minors = larger_minors
+    return minors[tuple(range(n))]
+
+
+def loop_closure(robot: Any, coordinates: Joints) -> Array:
+    """Return the square of the distance by which loops are open [m²], and a share.
+
+    The share is the determinant of the slopes by the joints that loops move,
+    relative to that at the robot's `loop_pose`: zero where the loops are singular,
+    negative on another branch.
+    """
+    gaps = loop_gaps(robot, coordinates)
+    _, slopes = gap_slopes(robot, coordinates)
+    pose = jnp.asarray(robot.loop_pose, coordinates.dtype)
+    _, slopes_of_pose = gap_slopes(robot, pose)
+    share = determinant(slopes) / determinant(slopes_of_pose)
+    return jnp.stack([gaps @ gaps, share])
+
+
+class Closure(eqx.Module):
+    """Closing of the loops of a robot."""
+
+    robot: Any
+
+    def of_sample(self, q: Joints) -> Array:
+        """Return the coordinates of all joints of one sample, and `loop_closure`."""
+        coordinates = closed_coordinates(self.robot, q)
+        return jnp.concatenate([coordinates, loop_closure(self.robot, coordinates)])
+
+    def of_samples(self, q: ManyJoints) -> AnyArray:
+        """Return the same of many samples."""
+        return evaluate_samples(self, self.of_sample, q)
+
+
+def close_loops(robot: Any, q: Numbers) -> ManyJoints:
+    """Return the coordinates of all joints; see `Robot.close`."""
+    q = as_array("q", q)
+    if q.shape[-1:] != (robot.joints,):
+        raise InputError(
+            f"`q` must have {robot.joints} joints along its last axis, but has shape "
+            f"{q.shape}."
+        )
+    if not robot.loops:
+        return linear_coordinates(robot.followers, q)
+    closure = Closure(robot).of_samples(q)
+    coordinates = closure[..., : robot.bodies]
+    squares = closure[..., robot.bodies]
+    max_gap = MAX_GAP[closure.dtype.name]
+    is_closed = (squares <= max_gap**2) & (closure[..., -1] > MIN_CLOSING_SHARE)
+    if is_traced(closure):
+        return jnp.where(is_closed[..., None], coordinates, jnp.nan)
+    if not np.all(is_closed):
+        sample = int(np.argmin(np.ravel(is_closed)))
+        pose = np.asarray(q).reshape(-1, robot.joints)[sample]
+        raise _open_error(robot, sample, pose, np.sqrt(np.ravel(squares)[sample]))
+    return coordinates
+
+
+def reachable(robot: Any, q: ManyJoints) -> ManyJoints:
+    """Return coordinates, moved towards `loop_pose` until loops close there safely.
+
+    Args:
+        robot: Robot, which may have no loops.
+        q: Coordinates of the joints that move alone, such as random ones.
+    """
+    if not robot.loops:
+        return q
+    middle = np.asarray(robot.loop_pose)[: robot.joints]
+    q = np.array(q, np.float64)
+    for _ in range(MAX_APPROACHES):
+        closure = Closure(robot).of_samples(q)
+        is_open = closure[..., robot.bodies] > MAX_GAP[closure.dtype.name] ** 2
+        is_open |= ~(closure[..., -1] > MIN_SAFE_SHARE)
+        if not is_open.any():
+            break
+        q[is_open] = middle + APPROACH * (q[is_open] - middle)
+    return q
+
+
+def _open_error(robot: Any, sample: int, pose: np.ndarray, distance: float):
+    """Return the error of a motion whose loops do not close at a sample."""
+    positions = ", ".join(f"{x:.4g}" for x in pose)
+    loops = ", ".join(f"`{loop.name}`" for loop in robot.loops)
+    fault = f"the points of {loops} stay {distance:.3g} m apart"
+    if distance <= MAX_GAP["float32"]:
+        fault = f"{loops} would have to pass a singular pose"
+    return InputError(
+        f"the loops of `{robot.name}` do not close at sample {sample}, where "
+        f"{', '.join(robot.joint_names)} are at {positions}: {fault}; keep `q` within "
+        "the reach of the mechanism, on the branch of the description."
+    )

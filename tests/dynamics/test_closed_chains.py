@@ -1,0 +1,168 @@
+"""Closed chains: MuJoCo's tree without the constraint, projected on the motors."""
+
+import jax
+import mujoco
+import numpy as np
+import pytest
+from closed_chains import MECHANISMS, mjcf, projection
+
+import jaxid as jid
+from jaxid.errors import InputError
+from jaxid.robot.loop_assembly import with_loops
+from jaxid.robot.urdf import urdf_parameters
+
+SAMPLES = 6
+
+
+@pytest.fixture(params=MECHANISMS)
+def mechanism(request):
+    return MECHANISMS[request.param]
+
+
+@pytest.fixture
+def path(mechanism, tmp_path):
+    file = tmp_path / "mechanism.xml"
+    file.write_text(mechanism.text)
+    return file
+
+
+def motion_of(robot, spread, samples=SAMPLES):
+    """Random motion of the motors near the pose of the file."""
+    random = np.random.default_rng(3)
+    q, qd, qdd = random.uniform(-1.0, 1.0, (3, samples, robot.joints))
+    middle = np.asarray(robot.loop_pose)[: robot.joints]
+    return jid.Motion(middle + spread * q, 2.0 * qd, 5.0 * qdd)
+
+
+def projected(mechanism, robot, motion):
+    """Yield MuJoCo's projection, forces and mass matrix of each sample."""
+    model = mechanism.tree()
+    data = mujoco.MjData(model)
+    names = [model.joint(k).name for k in range(model.njnt)]
+    order = [robot.body_names.index(name) for name in names]
+    motors = [names.index(name) for name in robot.joint_names]
+    closed = robot.close(motion.q)
+    for q, qd, qdd in zip(closed, motion.qd, motion.qdd, strict=True):
+        tree = projection(model, data, q[order], motors, qd, qdd)
+        data.qacc[:] = tree.qdd
+        mujoco.mj_inverse(model, data)
+        matrix = np.zeros((model.nv, model.nv))
+        for row, unit in zip(matrix, np.eye(model.nv), strict=True):
+            mujoco.mj_mulM(model, data, row, unit)
+        forces = tree.ratios.T @ data.qfrc_inverse
+        yield tree, forces, tree.ratios.T @ matrix @ tree.ratios, order
+
+
+def test_forces_and_mass_matrix_are_projected_ones(mechanism, path):
+    robot, p = jid.load_mjcf(path), urdf_parameters(path)
+    assert robot.joint_names == mechanism.motors
+    model = jid.Model(robot, (jid.RigidBodies(),))
+    motion = motion_of(robot, mechanism.spread)
+    _, forces, matrices, _ = zip(*projected(mechanism, robot, motion), strict=True)
+    tolerance = {"rtol": 0, "atol": 1e-10 * np.abs(forces).max()}
+    np.testing.assert_allclose(model.inverse_dynamics(p, motion), forces, **tolerance)
+    theta = np.asarray(model.regressor(motion))
+    np.testing.assert_allclose(theta @ p, forces, **tolerance)
+    np.testing.assert_allclose(model.mass_matrix(p, motion.q), matrices, **tolerance)
+    qdd = model.forward_dynamics(p, motion, np.array(forces))
+    np.testing.assert_allclose(qdd, motion.qdd, atol=1e-9)
+    # The spatial form is what JAX differentiates.
+    sample = (robot.close(motion.q)[0], motion.qd[0], motion.qdd[0])
+    columns = jax.jit(model.spatial_form.columns)(*sample)
+    np.testing.assert_allclose(columns @ p, forces[0], **tolerance)
+
+
+def test_base_parameters_are_as_many_as_the_rank_of_the_projected_tree(mechanism, path):
+    robot = jid.load_mjcf(path)
+    base = jid.base_parameters(jid.Model(robot, (jid.RigidBodies(),)))
+    assert base.smallest_independent > 1e6 * base.largest_dependent
+    assert not base.notes
+
+    tree_path = path.with_name("tree.xml")
+    tree_path.write_text(mechanism.text.replace("<connect", "<connect active='false'"))
+    tree = jid.Model(jid.load_mjcf(tree_path), (jid.RigidBodies(),))
+    motion = motion_of(robot, mechanism.spread, 40)
+    rows = []
+    closed = robot.close(motion.q)
+    for k, (sample, *_, order) in enumerate(projected(mechanism, robot, motion)):
+        theta = tree.regressor(jid.Motion(closed[k, order], sample.qd, sample.qdd))
+        rows.append(sample.ratios.T @ np.asarray(theta))
+    stacked = np.concatenate(rows)
+    norms = np.linalg.norm(stacked, axis=0)
+    values = np.linalg.svd(stacked / np.where(norms > 1e-9, norms, 1.0))[1]
+    assert base.size == np.count_nonzero(values > 1e-8 * values[0])
+
+
+@pytest.mark.parametrize("mechanism", [MECHANISMS["slider"]])
+def test_derivatives_are_those_of_differences(path):
+    robot, p = jid.load_mjcf(path), urdf_parameters(path)
+    motion = motion_of(robot, 0.5, 1)
+
+    @jax.jit
+    def forces(q, size):
+        moved = robot.replace(offset=robot.offset * size)
+        model = jid.Model(moved, (jid.RigidBodies(),))
+        return model.inverse_dynamics(p, q, motion.qd[0], motion.qdd[0])[0]
+
+    point = np.array([motion.q[0, 0], 1.0])
+    slopes = jax.jit(jax.grad(forces, (0, 1)))(point[:1], point[1])
+    for direction, slope in zip(1e-5 * np.eye(2), slopes, strict=True):
+        after = point + direction
+        before = point - direction
+        change = forces(after[:1], after[1]) - forces(before[:1], before[1])
+        np.testing.assert_allclose(np.ravel(slope), change / 2e-5, rtol=1e-6)
+
+
+def test_loops_keep_their_branch_and_name_the_sample_that_does_not_close(tmp_path):
+    path = tmp_path / "mechanism.xml"
+    path.write_text(MECHANISMS["palletiser"].text)
+    robot = jid.load_mjcf(path)
+    t, u, c = np.random.default_rng(0).uniform(-0.5, 0.5, (3, 50))
+    q = np.stack([t, 1.4 + u, 0.1 + c], axis=-1)
+    # The other branch of the parallelogram has crossed bars.
+    np.testing.assert_allclose(robot.close(q)[:, 3], q[:, 2] - q[:, 1], atol=1e-9)
+    np.testing.assert_allclose(jax.jit(robot.close)(q)[:, 3], q[:, 2] - q[:, 1])
+    path.write_text(MECHANISMS["five-bar"].text)
+    robot = jid.load_mjcf(path)
+    q = np.array([[2.2, 0.9], [3.1, 0.0]])
+    with pytest.raises(InputError, match=r"do not close at sample 1.*`pin` stay"):
+        robot.close(q)
+    assert np.isnan(jax.jit(robot.close)(q)[1]).all()
+
+
+def test_loops_of_the_api_are_those_of_the_file(tmp_path):
+    mechanism = MECHANISMS["palletiser"]
+    path = tmp_path / "mechanism.xml"
+    path.write_text(mechanism.text)
+    robot = jid.load_mjcf(path)
+    path.write_text(mechanism.text.replace("<connect", "<connect active='false'"))
+    tree = jid.load_mjcf(path)
+    loop = jid.robots.Loop(
+        "pin",
+        bodies=tuple(tree.body_names.index(x) for x in "fr"),
+        points=[[-0.2, 0.0, 0.0], [0.8, 0.0, 0.0]],
+    )
+    pose = [mechanism.pose[name] for name in tree.body_names]
+    closed = with_loops(tree, [loop], mechanism.motors, pose)
+    assert closed.body_names == robot.body_names
+    q = np.array([0.2, 1.3, 0.2])
+    np.testing.assert_allclose(closed.close(q), robot.close(q), atol=1e-12)
+    for motors, sentence in (
+        (("t", "u", "u"), "names joint `u` twice"),
+        (("t", "u", "x"), "but `x` is none of `t`, `u`"),
+        (("t", "u"), "2 freedom.* but 1 motor.* at `u`"),
+        (("t", "u", "c", "r"), "2 freedom.* but 3 motor"),
+    ):
+        with pytest.raises(InputError, match=sentence):
+            with_loops(tree, [loop], motors, pose)
+
+
+def test_files_whose_loops_do_not_close_are_one_sentence(tmp_path):
+    mechanism = MECHANISMS["five-bar"]
+    path = tmp_path / "mechanism.xml"
+    path.write_text(mjcf(mechanism, mechanism.pose | {"a2": 0.0}))
+    with pytest.raises(InputError, match=r"loop `pin` of .* m apart; give a pose"):
+        jid.load_mjcf(path)
+    path.write_text(mjcf(mechanism, mechanism.pose, motors=("a1",)))
+    with pytest.raises(InputError, match=r"have 2 freedom.* but 1 motor.* at `a1`"):
+        jid.load_mjcf(path)
