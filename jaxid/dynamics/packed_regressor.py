@@ -6,6 +6,7 @@ every motion.
 
 import functools
 from collections.abc import Callable, Sequence
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -19,6 +20,7 @@ from jaxid.program import (
     Program,
     Shape,
     evaluate_rows,
+    kernel_options,
     lower,
     on_any_platform,
     packed_entries,
@@ -106,7 +108,7 @@ class JointRegressor(eqx.Module):
 
 @functools.lru_cache(maxsize=CACHE_SIZE)
 def _compiled_gram(regressor: JointRegressor):
-    return jax.jit(regressor.gram)
+    return jax.jit(regressor.gram, compiler_options=kernel_options(regressor.program))
 
 
 def gram(
@@ -161,7 +163,9 @@ class PackedRegressor(eqx.Module):
         self.places = _places(program)
         self.samples = len(samples[0])
         self.columns = program.output_shapes[0][1]
-        if self.samples > MAX_SAMPLES_IN_NUMPY or is_traced(arrays):
+        if is_traced(arrays):
+            self.values = _distinct_values(program, *arrays)
+        elif self.samples > MAX_SAMPLES_IN_NUMPY:
             self.values = _compiled(program)(*arrays)
         else:
             self.values = tuple(evaluate_rows(program, *arrays))
@@ -200,8 +204,14 @@ def _places(program: Program):
     return tuple(places)
 
 
+def _distinct_values(program: Program, *arrays: Any) -> Any:
+    """Return the distinct entries of arrays with samples last."""
+    if program.loops is not None:
+        return distinct_rows(program, *(a.T for a in arrays))
+    return on_any_platform(program, Lowered.distinct, *arrays)
+
+
 @functools.lru_cache(maxsize=CACHE_SIZE)
 def _compiled(program: Program):
-    if program.loops is not None:
-        return jax.jit(lambda *x: distinct_rows(program, *(a.T for a in x)))
-    return jax.jit(functools.partial(on_any_platform, program, Lowered.distinct))
+    function = functools.partial(_distinct_values, program)
+    return jax.jit(function, compiler_options=kernel_options(program))

@@ -31,7 +31,7 @@ from jaxid.arrays import (
 from jaxid.dynamics.base import BaseParameters
 from jaxid.measurement.filters import AbstractLowPass
 from jaxid.measurement.observations import Observations, Progress
-from jaxid.program import Program, lower
+from jaxid.program import Program, kernel_options, lower
 from jaxid.program.sample_methods import program_of
 
 from .factors import Factors, JointFactor, divide_rows, row_chunks, without_tool
@@ -471,7 +471,7 @@ def _compile_loop(
         grams = [jnp.zeros((len(x), len(x))) for x in distinct_columns.places]
         return jax.lax.fori_loop(0, count, iteration, (tails, grams))[1]
 
-    return jax.jit(run)
+    return jax.jit(run, compiler_options=kernel_options(program))
 
 
 def _iteration_part(x: AnyArray, k: Array, length: int) -> Array:

@@ -97,7 +97,7 @@ class Observations(eqx.Module):
     ) -> "Observations":
         """Make observations of arrays (samples x joints) of the joint side.
 
-        The motion must be filtered already.
+        The motion must be filtered already; arrays of `float64` are not copied.
 
         Args:
             q: Joint angles [rad or m].
@@ -203,7 +203,8 @@ class Observations(eqx.Module):
     @property
     def instants(self) -> np.ndarray:
         """Indices of the samples at which the rows lie."""
-        return np.concatenate([np.asarray(r) for r in self._row_samples()])
+        parts = [np.arange(r.start, r.stop, r.step) for r in self._row_samples()]
+        return np.concatenate(parts)
 
     def _row_samples(self) -> list[range]:
         edge = self.filter.edge(self.sample_time)
@@ -212,9 +213,8 @@ class Observations(eqx.Module):
     def _times(self, samples: Sequence[range]) -> Vector:
         """Return the times of samples of each segment [s]."""
         parts = []
-        for indices, (a, _), start in zip(
-            samples, self.segments, self.start_times, strict=True
-        ):
+        segments = zip(samples, self.segments, self.start_times, strict=True)
+        for indices, (a, _), start in segments:
             parts.append(start + self.sample_time * (np.asarray(indices) - a))
         return np.concatenate(parts)
 

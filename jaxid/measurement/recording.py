@@ -81,6 +81,7 @@ class Recording(eqx.Module):
     ) -> "Recording":
         """Make a recording of arrays (samples x joints) in SI units, and check them.
 
+        Arrays of `float64` are not copied.
         Repeated stamps are removed, uneven ones are interpolated on a uniform grid, and
         gaps split the recording into segments; `notes` says what was done.
 
@@ -209,22 +210,22 @@ def finite_channel(
     name: str, key: str, value: ArrayLike, shape: tuple[int, ...], first_row: int
 ) -> np.ndarray:
     """Return a channel as finite real numbers."""
-    array = np.array(value, np.float64)
+    array = np.asarray(value, np.float64)
     if array.ndim != 2 or array.shape != shape:
         raise InputError(
             f"`{key}` of `{name}` must have one row for each sample and one column "
             f"for each joint, like the angles with shape {shape}, but has shape "
             f"{array.shape}."
         )
-    bad_entries = np.argwhere(~(np.abs(array) <= MAX_NUMBER))
-    if bad_entries.size:
-        row, joint = bad_entries[0].tolist()
-        raise InputError(
-            f"`{key}` of `{name}` must be finite and below {MAX_NUMBER:g}, but are "
-            f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: "
-            "check the unit, or repair or remove that row."
-        )
-    return array
+    if not array.size or max(-array.min(), array.max()) <= MAX_NUMBER:
+        return array
+    # NaN is neither above nor below the limit.
+    row, joint = np.argwhere(~(np.abs(array) <= MAX_NUMBER))[0].tolist()
+    raise InputError(
+        f"`{key}` of `{name}` must be finite and below {MAX_NUMBER:g}, but are "
+        f"{array[row, joint]:.3g} for joint {joint + 1} at row {row + first_row}: "
+        "check the unit, or repair or remove that row."
+    )
 
 
 def _finite_stamps(name: str, time: ArrayLike, samples: int) -> Vector:

@@ -21,4 +21,9 @@ from .program import (
     select_outputs as select_outputs,
 )
 from .trace import FREE as FREE, trace as trace
-from .xla import Lowered as Lowered, lower as lower, on_any_platform as on_any_platform
+from .xla import (
+    Lowered as Lowered,
+    kernel_options as kernel_options,
+    lower as lower,
+    on_any_platform as on_any_platform,
+)

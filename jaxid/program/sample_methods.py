@@ -11,7 +11,7 @@ import functools
 import math
 import threading
 from collections import OrderedDict
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -35,6 +35,7 @@ from .jax_transformation_rules import with_derivatives_of
 from .numpy_evaluation import evaluate
 from .program import Program, Shape
 from .trace import trace
+from .xla import kernel_options
 from .xla_sample_blocks import BLOCK, on_rows
 
 
@@ -116,6 +117,13 @@ def with_open_numbers(model: eqx.Module, method: str) -> tuple[OpenModel, np.nda
 
 MAX_SAMPLES_IN_NUMPY = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
+PART_NUMBERS = 2**20
+"""Numbers of a result in NumPy that are compiled and computed together.
+
+Their 8 MB of XLA's memory are used again for the next part. XLA's memory for a whole
+regressor would be new in every call, and its pages cost more than the arithmetic; NumPy
+asks for large pages. The compiled function serves every larger number of samples.
+"""
 CACHE_SIZE = 64
 """Number of programs that are kept, of the models that were used last."""
 MAX_JOINTS = {"inertia": 16, "acceleration": 16}
@@ -211,7 +219,8 @@ class SampleMethod:
     @functools.cached_property
     def compiled(self) -> Callable:
         """`over_rows`, compiled."""
-        return jax.jit(self.over_rows)
+        options = None if self.is_long else kernel_options(self.program)
+        return jax.jit(self.over_rows, compiler_options=options)
 
 
 def definition_on_rows(definition: Callable, *arrays: Array) -> Array:
@@ -302,9 +311,46 @@ def on_samples(
         with jax.default_device(*devices):
             return jnp.asarray(results)
 
+    has_common_parameters = all(x.ndim == 1 for x in parameters)
+    if has_common_parameters and not jax_arrays and jax.default_backend() == "cpu":
+        return _in_parts(method, batch, parameters, samples, dtype)
     inputs = [jnp.asarray(x, dtype) for x in arrays]
     results = _over_batches(method.compiled, batch, inputs, len(shared))
     return results if jax_arrays else np.asarray(results)
+
+
+def _in_parts(
+    method: SampleMethod,
+    batch: Shape,
+    parameters: Sequence[AnyArray],
+    samples: Sequence[AnyArray],
+    dtype: np.dtype,
+) -> np.ndarray:
+    """Apply a compiled method to arrays of NumPy, part by part, on a CPU."""
+    count = math.prod(batch)
+    numbers = max(1, math.prod(method.output_shape))
+    size = max(1, min(count, max(BLOCK, PART_NUMBERS // numbers)))
+    rows = []
+    for x in samples:
+        entries = x.shape[-1]
+        rows.append(np.broadcast_to(x, (*batch, entries)).reshape(count, entries))
+    results = np.empty((count, *method.output_shape), dtype)
+
+    previous_part = slice(0)
+    previous_values: AnyArray = results[previous_part]
+    for k in range(0, count, size):
+        # The last part begins earlier, so that it is as long as the others.
+        start = min(k, count - size)
+        part = slice(start, start + size)
+        inputs = [x[part] for x in rows]
+        values = method.compiled(
+            *(jnp.asarray(x, dtype) for x in (*parameters, *inputs))
+        )
+        # While this part is computed, the one before is copied.
+        results[previous_part] = previous_values
+        previous_part, previous_values = part, values
+    results[previous_part] = previous_values
+    return results.reshape(*batch, *method.output_shape)
 
 
 def _batch_shape(arrays: list[AnyArray]):

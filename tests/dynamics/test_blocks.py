@@ -54,6 +54,24 @@ def test_numpy_stays_in_numpy_and_jax_in_jax():
     assert isinstance(MODEL.inverse_dynamics(P, in_jax(x)), jax.Array)
 
 
+def test_arrays_of_numpy_are_computed_in_parts(monkeypatch):
+    monkeypatch.setattr(sample_methods, "MAX_SAMPLES_IN_NUMPY", 0)
+    # Of 256 samples: the regressor of 700 has three parts, that of 1400 six.
+    monkeypatch.setattr(sample_methods, "PART_NUMBERS", 1)
+    method = sample_methods.method_of(MODEL, MODEL.columns, (2,), (2,), (2,))
+    compiled_before = method.compiled._cache_size()
+    x = motion(1400)
+    expected = in_numpy(MODEL, MODEL.columns, x.q, x.qd, x.qdd)
+    np.testing.assert_allclose(MODEL.regressor(x), expected, atol=1e-12)
+    np.testing.assert_allclose(MODEL.regressor(x[:700]), expected[:700], atol=1e-12)
+    pairs = Motion(*(a.reshape(2, 700, 2) for a in (x.q, x.qd, x.qdd)))
+    columns = MODEL.regressor(pairs)
+    assert type(columns) is np.ndarray
+    np.testing.assert_allclose(columns.reshape(expected.shape), expected, atol=1e-12)
+    # One compiled function serves them all.
+    assert method.compiled._cache_size() <= compiled_before + 1
+
+
 @pytest.mark.parametrize("samples", [3, 300])
 def test_leading_axes_of_parameters_and_motion_broadcast(samples):
     many = P * np.array([1.0, 2.0, 3.0])[:, None, None]
