@@ -393,6 +393,10 @@ def test_capsules_of_the_user_replace_meshes_that_are_missing(tmp_path):
     # The third link still has no shape.
     assert [fault.split(":")[0] for fault in surroundings.faults[:1]] == ["link `l3`"]
     assert "give `capsules`" in surroundings.faults[0]
+    # Links without their meshes share a sentence.
+    fault, _ = load_experiment(arm(tmp_path, shape=mesh)).surroundings.faults
+    assert fault.startswith("links `l1`, `l2`, `l3`: geometry not read (")
+    assert "; 2 more like it); give `capsules`" in fault
 
 
 def test_limits_forces_by_nominal_parameters(designed, run, no_pictures, monkeypatch):
@@ -534,7 +538,7 @@ def test_limits_that_nobody_gave_are_named(written, excited):
     said = [remark.text for remark in plan_remarks(plan)]
     assert (
         "The robot's description lacks these limits, so they are assumed: acceleration "
-        "of `hinge` (8 rad/s²)."
+        "8 rad/s² of `hinge`."
     ) in said
     assert not any("ssumed" in remark.text for remark in plan_remarks(excited.plan))
 

@@ -169,7 +169,7 @@ class BaseParameters(Summarised, Hashable):
         arrays = [np.asarray(x, np.float64).T for x in arguments]
         shapes = [x.shape[:1] for x in arrays]
         regressor = JointRegressor(self, self.columns, *shapes)
-        return [rows.T for rows in regressor.in_numpy(*arrays)]
+        return [np.asarray(rows).T for rows in regressor.evaluate(*arrays)]
 
     def forces_in_numpy(self, p: AnyArray, motion: Motion) -> np.ndarray:
         r"""Return the forces $\Theta_B p_B$ [N m or N] in float64 (Eq. 39)."""

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced
+from jaxid.arrays import AnyArray, Array, Float, as_array, is_traced, namespace
 from jaxid.errors import InputError
 from jaxid.program import (
     Lowered,
@@ -24,9 +24,10 @@ from jaxid.program import (
     lower,
     on_any_platform,
     packed_entries,
+    select_outputs,
 )
 from jaxid.program.sample_methods import CACHE_SIZE, MAX_SAMPLES_IN_NUMPY, program_of
-from jaxid.program.xla_sample_blocks import distinct_rows, row_products
+from jaxid.program.xla_sample_blocks import distinct_rows, packed_columns, row_products
 
 Columns = tuple[int, ...]
 """Positions of columns, in order."""
@@ -95,8 +96,16 @@ class JointRegressor(eqx.Module):
             total = total.at[place[:, None], place].add(weighted_product)
         return total
 
-    def in_numpy(self, *arrays: AnyArray) -> list[np.ndarray]:
-        """Return the columns of each joint, evaluated in NumPy."""
+    def evaluate(self, *arrays: AnyArray) -> list[Any]:
+        """Return the columns of each joint [columns, *batch], each entry stored.
+
+        NumPy evaluates arrays of NumPy; XLA evaluates others, in blocks of samples.
+        """
+        if namespace(*arrays) is not np:
+            program = _nonzero_program(self.program)
+            packed_values = packed_columns(program, *map(jnp.asarray, arrays))
+            ends = np.cumsum([len(entries) for entries in self.entries])
+            return jnp.split(packed_values, ends[:-1])
         batch = np.shape(arrays[0])[1:]
         distinct_rows = evaluate_rows(self.program, *arrays)
         joints = []
@@ -104,6 +113,12 @@ class JointRegressor(eqx.Module):
             values = packed_entries(self.program, distinct_rows, entries)
             joints.append(values.reshape(len(entries), *batch))
         return joints
+
+
+@functools.lru_cache(maxsize=CACHE_SIZE)
+def _nonzero_program(program: Program):
+    """Return the program of the entries that are not always zero."""
+    return select_outputs(program, np.flatnonzero(program.nonzeros))
 
 
 @functools.lru_cache(maxsize=CACHE_SIZE)

@@ -1,6 +1,7 @@
 """Design of motions that determine the base parameters well (Eq. 36)."""
 
 from . import constraints as constraints, criteria as criteria
+from .compiled_search import CompiledSearch as CompiledSearch
 from .design import (
     DesignProgress as DesignProgress,
     design_excitation as design_excitation,

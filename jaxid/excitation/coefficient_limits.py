@@ -5,7 +5,7 @@ a limit near one. All rows are scaled alike: a motion keeps its limits if |R y -
 in every row.
 """
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -19,26 +19,29 @@ from jaxid.trajectory.trajectory import AbstractBasis, Coefficients
 
 ScaledMotion = Float[AnyArray, " scaled"]
 """Scaled coefficients of a motion, joint by joint."""
-ScaledMotions = Float[np.ndarray, "starts scaled"]
+ScaledMotions = Float[AnyArray, "starts scaled"]
 """Scaled coefficients of several motions."""
-PerJoint = np.ndarray
+PerJoint = AnyArray
 """One number for each joint."""
-RowValues = Float[AnyArray, "joints rows"]
-"""Rows of the limits of each joint, for a motion."""
+RowValues = Float[AnyArray, "*batch joints rows"]
+"""Rows of the limits of each joint, for a motion or several."""
 
 FILLED_FRACTION = 0.95
 """Fraction of its limits that a motion of full size uses."""
 
 
 class Extent(NamedTuple):
-    """Positions of a motion, and the use of the limits about their means."""
+    """Positions of motions, and the use of the limits about their means."""
 
-    positions: np.ndarray  # of each joint
+    positions: AnyArray  # of each joint
     use: PerJoint
 
 
 class Grid(NamedTuple):
-    """Limits of all joints on a grid of times."""
+    """Limits of all joints on a grid of times.
+
+    Its functions take one motion or several, in NumPy or JAX.
+    """
 
     # rows by scaled coefficients: of each joint first positions, then higher orders
     R: np.ndarray
@@ -51,40 +54,43 @@ class Grid(NamedTuple):
     constant: np.ndarray
 
     def rows(self, y: ScaledMotion) -> RowValues:
-        """Return the rows of a motion, R y, in NumPy or JAX."""
-        by_joint = y.reshape(self.constant.shape)
-        return namespace(y).einsum("jrk,jk->jr", self.R, by_joint)
+        """Return the rows of motions, R y."""
+        motion = self._by_joint(y)
+        return (_lead(self.R, motion.ndim + 1) @ motion[..., None])[..., 0]
 
     def use(self, y: ScaledMotion) -> RowValues:
         """Return the used fractions of the limits, with the sign of the direction."""
-        return (self.rows(y) - self.c) / self.bound
+        rows = self.rows(y)
+        return (rows - _lead(self.c, rows.ndim)) / self.bound
 
     def scale_into_limits(
         self,
         y: ScaledMotion,
-        bound: float | None = None,
-    ) -> np.ndarray:
-        """Return the nearest motion of the same shape that keeps |R y - c| <= bound.
+        bound: Any = None,
+    ) -> AnyArray:
+        """Return the nearest motions of the same shape that keep |R y - c| <= bound.
 
         Each joint's motion is scaled about its mean, then shifted into its range.
         """
         bound = self.bound if bound is None else bound
+        xp = namespace(y)
         extent = self._measure(y)
-        factors = np.minimum(1.0, bound / np.maximum(extent.use, 1e-12))
+        factors = xp.minimum(1.0, bound / xp.maximum(extent.use, 1e-12))
         return self._scale(y, extent.positions, factors, bound)
 
-    def shrink(self, y: ScaledMotion, factor: float) -> np.ndarray:
-        """Return a smaller motion, each joint's about its mean position."""
-        positions = self._measure(y).positions
-        return self._scale(y, positions, np.full(len(positions), factor), np.inf)
+    def shrink(self, y: ScaledMotion, factor: float) -> AnyArray:
+        """Return smaller motions, each joint's about its mean position."""
+        extent = self._measure(y)
+        factors = np.full(extent.use.shape, factor)
+        return self._scale(y, extent.positions, factors, np.inf)
 
     def fill(
         self, y: ScaledMotion, places: PerJoint, size: PerJoint | float
-    ) -> np.ndarray:
-        """Return a motion of the same shape that fills a fraction of all limits.
+    ) -> AnyArray:
+        """Return motions of the same shape that fill a fraction of all limits.
 
         Args:
-            y: Motion whose shape is kept.
+            y: Motions whose shape is kept.
             places: Where each joint moves within its range: 0 at the lower, 1 at the
                 upper end.
             size: Size of the motion, or of that of each joint; at 1 it uses 95 % of a
@@ -96,42 +102,50 @@ class Grid(NamedTuple):
         low, high = self._shift_range(positions, factors, bound)
         return self._move(y, factors, low + (high - low) * np.asarray(places))
 
+    def _by_joint(self, y: ScaledMotion):
+        """Return scaled coefficients [*batch, joints, coefficients]."""
+        return y.reshape(*y.shape[:-1], *self.constant.shape)
+
     def _measure(self, y: ScaledMotion):
         """Return the positions, and the largest use of a limit by each joint."""
-        rows = self.rows(np.asarray(y))
-        positions, rates = np.split(rows, [len(self.kinds[0])], axis=1)
-        half_swing = 0.5 * np.ptp(positions, axis=1)
-        return Extent(positions, np.maximum(np.abs(rates).max(axis=1), half_swing))
+        xp = namespace(y)
+        rows = self.rows(y)
+        positions = rows[..., : len(self.kinds[0])]
+        rates = rows[..., len(self.kinds[0]) :]
+        half_swing = 0.5 * (positions.max(axis=-1) - positions.min(axis=-1))
+        return Extent(positions, xp.maximum(xp.abs(rates).max(axis=-1), half_swing))
 
     def _scale(
         self,
         y: ScaledMotion,
-        positions: np.ndarray,
+        positions: AnyArray,
         factors: PerJoint,
-        bound: float,
+        bound: Any,
     ):
-        """Return the motion scaled about its means, then shifted into the ranges."""
+        """Return motions scaled about their means, then shifted into the ranges."""
+        xp = namespace(y)
         low, high = self._shift_range(positions, factors, bound)
-        shifts = (1.0 - factors) * positions.mean(axis=1)
-        return self._move(y, factors, np.clip(shifts, low, np.maximum(low, high)))
+        shifts = (1.0 - factors) * positions.mean(axis=-1)
+        return self._move(y, factors, xp.clip(shifts, low, xp.maximum(low, high)))
 
     def _shift_range(
         self,
-        positions: np.ndarray,
+        positions: AnyArray,
         factors: PerJoint,
-        bound: float,
+        bound: Any,
     ):
         """Return the shifts between which scaled positions keep their range."""
-        centre = self.c[:, 0]
-        low = centre - bound - factors * positions.min(axis=1)
-        high = centre + bound - factors * positions.max(axis=1)
+        centre = _lead(self.c[:, 0], factors.ndim)
+        low = centre - bound - factors * positions.min(axis=-1)
+        high = centre + bound - factors * positions.max(axis=-1)
         return low, high
 
     def _move(self, y: ScaledMotion, factors: PerJoint, shifts: PerJoint):
         """Return the motion of each joint times a factor, and shifted."""
-        motion = np.asarray(y).reshape(self.constant.shape)
-        moved_motion = factors[:, None] * motion + shifts[:, None] * self.constant
-        return moved_motion.reshape(-1)
+        scaled_motion = factors[..., None] * self._by_joint(y)
+        constant = _lead(self.constant, scaled_motion.ndim)
+        moved_motion = scaled_motion + shifts[..., None] * constant
+        return moved_motion.reshape(y.shape)
 
 
 class JointLimits(eqx.Module):
@@ -204,7 +218,7 @@ class JointLimits(eqx.Module):
 
     def coefficients(self, y: AnyArray) -> AnyArray:
         """Return the coefficients of trajectories from scaled ones."""
-        scale = np.asarray(self.scale)[(None,) * (y.ndim - 1)]
+        scale = _lead(np.asarray(self.scale), y.ndim + 1)
         return y.reshape((*y.shape[:-1], *self.shape)) * scale
 
     def scaled(self, x: Coefficients) -> np.ndarray:
@@ -251,9 +265,12 @@ class JointLimits(eqx.Module):
         random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         shapes = random.standard_normal((count, joints * variables))
         places = random.random((count, joints))
-        grid = self.grid()
-        pairs = zip(shapes, places, strict=True)
-        return np.array([grid.fill(shape, place, 1.0) for shape, place in pairs])
+        return self.grid().fill(shapes, places, 1.0)
+
+
+def _lead(x: np.ndarray, axes: int) -> np.ndarray:
+    """Return an array with leading axes of length one, up to this number of axes."""
+    return x[(None,) * (axes - x.ndim)]
 
 
 def _unknown_limits(limits: Limits):

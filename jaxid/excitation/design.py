@@ -16,6 +16,7 @@ from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory
 
 from .coefficient_limits import ScaledMotions
+from .compiled_search import compiled_search, plan_parts
 from .constraints import AbstractConstraint
 from .criteria import AbstractCriterion
 from .criteria.information_matrix import BaseMatrix, JointVector
@@ -153,7 +154,9 @@ def minimise(
         problem: Problem to be solved.
         solver: Another solver: a function of the problem and of random motions [starts,
             scaled] that returns better motions. What comes out is made to keep the
-            limits of the joints for all times, and the best motion is taken.
+            limits of the joints for all times, and the best motion is taken. By
+            default the search runs in NumPy on a CPU, and as one program of JAX
+            (`CompiledSearch`) where JAX has a GPU.
         starts: Number of random motions to start from.
         generations: Number of generations.
         key: Key of the random motions; `jax.random.key(0)` if None.
@@ -178,11 +181,14 @@ def minimise(
         raise InputError("`begin` must be a motion of the problem's basis.")
     start_time = time.monotonic()
     key = jax.random.key(0) if key is None else key
-    x = problem.limits.random(key, starts)
+    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    if problem.constraints:
+        x = random_feasible_motions(problem, random, starts).x
+    else:
+        x = problem.limits.random(key, starts)
     values = criterion_values(problem, x)
     median_motion = x[np.argsort(values)[starts // 2]]
     if solver is None:
-        random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
         duration = math.inf if seconds is None else max(seconds, MIN_DURATION)
         clock = Clock(start_time, duration)
         outcome = _run_search(problem, x, begin, generations, random, clock, progress)
@@ -249,16 +255,18 @@ def _run_search(
 ):
     """Do all steps of a search, or those until the time is over or Ctrl-C."""
     deadline = clock.start_time + SEARCH_SHARE * clock.duration
-    if problem.constraints:
-        x = random_feasible_motions(problem, random, len(x)).x
     if begin is not None:
         x[0] = problem.limits.scaled(begin.coefficients)
     # With constraints the search looks for one motion that keeps them first.
     candidates = evaluate_within_limits(problem, x[:1] if problem.constraints else x)
+    run = search
     steps = count_steps(problem, len(x), generations)
+    if jax.default_backend() == "gpu":
+        run = compiled_search
+        steps = len(plan_parts(problem, generations).origin)
     history = []
     try:
-        for step in search(problem, x, candidates, generations, random, deadline):
+        for step in run(problem, x, candidates, generations, random, deadline):
             candidates = step.candidates
             history.append(candidates.best_value)
             elapsed_time = time.monotonic() - clock.start_time

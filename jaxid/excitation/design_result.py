@@ -59,8 +59,8 @@ class ExcitationPlan(Summarised, eqx.Module):
         criterion: Criterion that was minimised.
         limits: Limits of the joints, with those that were assumed.
         information: Information of one run of the motion.
-        reference: Information of a random motion that fills the same limits: the median
-            of the starts.
+        reference: Information of a random motion that keeps the same limits, as far as
+            any was found: the median of the motions from which the search started.
         noise: Assumed standard deviation of the forces' noise by joint [N m or N].
         samples: Number of measured samples of one run.
         findings: Use of the constraints beside the limits of the joints.
@@ -142,11 +142,12 @@ class ExcitationPlan(Summarised, eqx.Module):
     def undetermined(self) -> tuple[str, ...]:
         """Names of base parameters that this motion cannot determine.
 
-        Their deviations make forces on a random motion that are more than ten times
-        the noise (RMS): a tenth of the largest forces with the usual noise.
+        Their deviations make forces that are more than ten times the noise (RMS), a
+        tenth of the largest forces with the usual noise, on random motions that fill
+        the limits of the joints.
         """
         rows = self.samples * len(self.noise)
-        column_rms = np.sqrt(np.diag(self.reference.weighted) / rows)
+        column_rms = 1.0 / (np.asarray(self.information.sizes) * np.sqrt(rows))
         is_open = ~(self.standard_deviations * column_rms <= MAX_OPEN_NOISE)
         return tuple(self.base.names[k] for k in np.flatnonzero(is_open))
 
@@ -201,8 +202,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         if gain < 1.0:
             text = (
                 f"Standard deviations are {1.0 / gain:.3g} times those of a random "
-                "motion that keeps the limits of the joints only: search longer "
-                "(`--resume`)"
+                "motion within the same limits: search longer (`--resume`)"
             )
             remark = Remark(text, Status.DOUBTFUL)
         remarks = [remark]

@@ -4,7 +4,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, namespace
 
 from .coefficient_limits import Grid, ScaledMotion, ScaledMotions
 from .problem import MAX_COARSE_EXCESS, ExcitationProblem
@@ -32,7 +32,7 @@ class Candidates(NamedTuple):
     @property
     def violation(self) -> PerStart:
         """Excess where a constraint is not kept; zero elsewhere."""
-        return np.maximum(np.asarray(self.excess), 0.0)
+        return namespace(self.excess).maximum(self.excess, 0.0)
 
     @property
     def is_feasible(self) -> bool:
@@ -49,9 +49,9 @@ class Candidates(NamedTuple):
         """Scaled coefficients of the best motion."""
         return np.asarray(self.x[self.order()[0]])
 
-    def order(self) -> np.ndarray:
+    def order(self) -> AnyArray:
         """Return the starts from best to worst, feasible motions first."""
-        return np.lexsort((np.asarray(self.value), self.violation))
+        return namespace(self.value).lexsort((self.value, self.violation))
 
     def promising(self) -> np.ndarray:
         """Return the starts, the most promising first: a small excess counts little."""
@@ -60,29 +60,36 @@ class Candidates(NamedTuple):
 
     def at(self, places: Any) -> "Candidates":
         """Return the motions at some places."""
-        return Candidates(*(np.asarray(part)[places] for part in self))
+        return Candidates(*(part[places] for part in self))
 
     def improved(self, places: np.ndarray, others: "Candidates") -> "Candidates":
         """Return these motions, with others at some places if those are better."""
-        present_motions = self.at(places)
-        is_smaller = others.violation < present_motions.violation
-        is_as_small = others.violation == present_motions.violation
-        is_better = is_smaller | (is_as_small & (others.value < present_motions.value))
-
+        better_motions = self.at(places).better_of(others)
         candidates = Candidates(*(np.array(part) for part in self))
-        for part, values in zip(candidates, others, strict=True):
-            part[places[is_better]] = np.asarray(values)[is_better]
+        for part, values in zip(candidates, better_motions, strict=True):
+            part[places] = values
         return candidates
+
+    def better_of(self, others: "Candidates") -> "Candidates":
+        """Return the better one of both motions at each place."""
+        xp = namespace(self.value)
+        is_smaller = others.violation < self.violation
+        is_as_small = others.violation == self.violation
+        is_better = is_smaller | (is_as_small & (others.value < self.value))
+        x = xp.where(is_better[:, None], others.x, self.x)
+        value = xp.where(is_better, others.value, self.value)
+        return Candidates(x, value, xp.where(is_better, others.excess, self.excess))
 
     def survivors(self, others: "Candidates") -> "Candidates":
         """Return the best of both, as many as these are; duplicates come last."""
+        xp = namespace(self.value)
         pairs = zip(self, others, strict=True)
-        all_motions = Candidates(*(np.concatenate(pair) for pair in pairs))
+        all_motions = Candidates(*(xp.concatenate(pair) for pair in pairs))
         sorted_motions = all_motions.at(all_motions.order())
-        value_steps = np.diff(sorted_motions.value, prepend=np.nan)
-        violation_steps = np.diff(sorted_motions.violation, prepend=np.nan)
+        value_steps = xp.diff(sorted_motions.value, prepend=np.nan)
+        violation_steps = xp.diff(sorted_motions.violation, prepend=np.nan)
         is_duplicate = (value_steps <= SAME_VALUE) & (violation_steps == 0.0)
-        order = np.argsort(is_duplicate, kind="stable")
+        order = xp.lexsort((is_duplicate,))
         return sorted_motions.at(order[: len(self.value)])
 
 
@@ -125,7 +132,7 @@ def evaluate_within_limits(problem: ExcitationProblem, x: ScaledMotions) -> Cand
 def _shrink_slightly(
     problem: ExcitationProblem,
     grid: Grid,
-    motion: np.ndarray,
+    motion: ScaledMotion,
 ):
     """Return a smaller motion that keeps constraints which are exceeded a little."""
     if not 0.0 < problem.excess(motion) <= MAX_COARSE_EXCESS:

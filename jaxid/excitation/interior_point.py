@@ -2,27 +2,43 @@
 
 Minimises f(y) subject to |R y - c| <= b, rows joint by joint, and to constraints that
 are not linear, which a common slack may exceed at a penalty. Each iteration evaluates
-value and gradient of every start once; the step towards the barrier's minimum needs
-products with the rows and one Cholesky factor for each start. Curvature is a damped
-BFGS matrix [1, procedure 18.2].
+value and gradient of all starts once; the step towards the barrier's minimum needs
+products with the rows and the solution of one linear system for each start. Curvature
+is a damped BFGS matrix [1, procedure 18.2].
 
-In NumPy: its matrices are small, and nothing is compiled.
+All starts are in arrays, in NumPy, where nothing is compiled, or in JAX, where a run is
+one loop on the device. Starts that have converged stay as they are.
 
 [1] J. Nocedal, S. Wright, Numerical Optimization, 2nd ed., 2006, chapters 18 and 19.
 """
 
-import math
-from collections.abc import Callable, Sequence
-from typing import NamedTuple
+from collections.abc import Callable
 
+import jax
+import jax.numpy as jnp
 import numpy as np
-import scipy
 
-from jaxid.arrays import Float
+from jaxid.arrays import AnyArray, namespace
 
 from .coefficient_limits import Grid, ScaledMotions
+from .interior_point_iterates import (
+    Evaluation,
+    Inequalities,
+    Iterates,
+    PerStart,
+    Slacks,
+    Stage,
+    Steps,
+    begin as begin,
+    dot,
+    limit_room,
+    outer,
+    room_of,
+    select,
+    split,
+    times,
+)
 
-INITIAL_CURVATURE = 0.3  # small, so that first steps are large
 MAX_SHARE_OF_WAY = 0.995  # fraction of the way to the next limit that a step may go
 DECREASE = 1e-4  # fraction of the promised decrease that a step must give
 DAMPING = 0.1  # fraction of the expected curvature below which a step is damped
@@ -34,423 +50,360 @@ CENTRALITY = 1e3  # factor by which multipliers may differ from the central path
 RIDGE = 1e-9  # added to the matrix, relative to its mean diagonal entry
 
 
-ScaledVector = Float[np.ndarray, " scaled"]
-ConstraintVector = Float[np.ndarray, " constraints"]
-SlackVector = Float[np.ndarray, " slacks"]  # one slack if there are constraints
-StepVector = Float[np.ndarray, " scaled_and_slack"]
-
-
-class Evaluation(NamedTuple):
-    """Objective and nonlinear constraints of one start, with their derivatives."""
-
-    value: float
-    gradient: ScaledVector
-    excess: ConstraintVector
-    slopes: np.ndarray  # of the constraints, by the scaled coefficients
-
-
-Inequalities = Float[np.ndarray, " inequalities"]
-"""One number for each inequality: its distance from the bound, or its multiplier.
-
-Limits of the joints, upwards, then downwards; constraints; sign of the slack if there
-are any.
-"""
-
-
-class Parts(NamedTuple):
-    """The numbers of inequalities by their kinds."""
-
-    limits: np.ndarray
-    constraints: ConstraintVector
-    slack: SlackVector
-
-
-class Iterate(NamedTuple):
-    """Present point of one start, its multipliers, and the step that is next."""
-
-    y: ScaledVector
-    slack: SlackVector
-    evaluation: Evaluation
-    duals: Inequalities  # multipliers
-    curvature: np.ndarray  # of the Lagrangian
-    barrier: float  # weight of the logarithmic barrier
-    step: StepVector
-    dual_step: Inequalities
-    length: float = 0.0  # fraction of the step that is tried
-    dual_length: float = 0.0
-    slope: float = 0.0  # derivative of the merit along the step
-    refusals: int = 0  # refused steps in a row
-    needs_evaluation: bool = True  # whether the point itself is to be evaluated next
-
-    @property
-    def trial(self) -> ScaledVector:
-        """Point to be evaluated next."""
-        return self.y + self.length * self.step[: len(self.y)]
-
-
-class Stage(NamedTuple):
-    """One run of the method."""
-
-    bound: float  # multiple to which limits are relaxed or tightened
-    barrier: float  # weight of the logarithmic barrier at the start
-    min_barrier: float  # weight below which the barrier does not fall
-    iterations: int  # largest number of iterations
-    sharpness: float = 4.0  # sharpness of smooth extremes in the objective
-    penalty: float = 10.0  # penalty of the slack by which constraints are exceeded
-
-
-def begin(grid: Grid, y: ScaledMotions, constraints: int = 0) -> list[Iterate]:
-    """Return the iterates of some starts before the first stage."""
-    size = np.shape(y)[1]
-    slack = np.zeros(1 if constraints else 0)
-    duals = np.zeros(2 * grid.c.size + constraints + len(slack))
-    zero_slopes = np.zeros((constraints, size))
-    evaluation = Evaluation(0.0, np.zeros(size), np.zeros(constraints), zero_slopes)
-    curvature = INITIAL_CURVATURE * np.eye(size)
-    step = np.zeros(size + len(slack))
-    return [
-        Iterate(np.array(point), slack, evaluation, duals, curvature, 0.0, step, duals)
-        for point in y
-    ]
-
-
 def run(
     grid: Grid,
-    objective: Callable[[np.ndarray, Sequence[int]], Sequence[Evaluation]],
-    iterates: list[Iterate],
+    objective: Callable[[ScaledMotions], Evaluation],
+    iterates: Iterates,
     stage: Stage,
-) -> list[Iterate]:
-    """Move the starts inside the bound of a stage, and iterate to convergence.
+) -> Iterates:
+    """Move the starts inside the bound of a stage, and iterate to convergence."""
 
-    The objective evaluates points [points, scaled] of starts with these numbers.
-    """
-    iterates = [_begin_stage(grid, stage, iterate) for iterate in iterates]
-    for _ in range(stage.iterations):
-        active_starts = [
-            k for k, each in enumerate(iterates) if not _has_converged(stage, each)
-        ]
-        if not active_starts:
-            break
-        points = np.array([iterates[k].trial for k in active_starts])
-        evaluations = objective(points, active_starts)
-        for k, evaluation in zip(active_starts, evaluations, strict=True):
-            with np.errstate(all="ignore"):
-                iterates[k] = _update(grid, stage, iterates[k], evaluation)
-    return iterates
+    def goes_on(state):
+        count, iterates = state
+        is_active = ~_have_converged(stage, iterates)
+        return (count < stage.iterations) & is_active.any()
 
+    def iterate(state):
+        count, iterates = state
+        evaluation = objective(iterates.trial)
+        updated_iterates = _update(grid, stage, iterates, evaluation)
+        is_fixed = _have_converged(stage, iterates)
+        return count + 1, select(is_fixed, iterates, updated_iterates)
 
-def _has_converged(stage: Stage, iterate: Iterate):
-    """Return whether the promised decrease is rounding."""
-    if iterate.barrier > stage.min_barrier or iterate.needs_evaluation:
-        return False
-    return abs(iterate.slope) <= 1e-14 * (1.0 + abs(iterate.evaluation.value))
+    state = (0, _begin_stage(grid, stage, iterates))
+    if namespace(iterates.y) is jnp:
+        return jax.lax.while_loop(goes_on, iterate, state)[1]
+    with np.errstate(all="ignore"):
+        while goes_on(state):
+            state = iterate(state)
+    return state[1]
 
 
-def _begin_stage(grid: Grid, stage: Stage, iterate: Iterate):
-    """Move one start inside the bound, with multipliers on the central path."""
+def _have_converged(stage: Stage, iterates: Iterates):
+    """Return whether the promised decrease of each start is rounding."""
+    xp = namespace(iterates.y)
+    value = iterates.evaluation.value
+    is_small = xp.abs(iterates.slope) <= 1e-14 * (1.0 + xp.abs(value))
+    has_final_barrier = iterates.barrier <= stage.min_barrier
+    return is_small & has_final_barrier & ~iterates.needs_evaluation
+
+
+def _begin_stage(grid: Grid, stage: Stage, iterates: Iterates):
+    """Move all starts inside the bound, with multipliers on the central path."""
+    xp = namespace(iterates.y)
     bound = START_FRACTION * (stage.bound * grid.bound)
-    y = grid.scale_into_limits(iterate.y, bound)
-    central_duals = stage.barrier / _limit_room(grid, stage, y)
-    duals = np.array(iterate.duals)
-    limit_duals = duals[: len(central_duals)]
-    if not limit_duals.any() or (y != iterate.y).any():
-        limit_duals[:] = central_duals
-    else:
-        limit_duals[:] = _clip_to_central_path(limit_duals, central_duals)
-    return iterate._replace(
+    y = grid.scale_into_limits(iterates.y, bound)
+    central_duals = stage.barrier / limit_room(grid, stage, y)
+    limits = central_duals.shape[1]
+    limit_duals = iterates.duals[:, :limits]
+    is_new = ~limit_duals.any(axis=1) | (y != iterates.y).any(axis=1)
+    clipped_duals = _clip_to_central_path(limit_duals, central_duals)
+    limit_duals = xp.where(is_new[:, None], central_duals, clipped_duals)
+    return iterates._replace(
         y=y,
-        duals=duals,
-        barrier=stage.barrier,
-        step=np.zeros_like(iterate.step),
-        length=0.0,
-        needs_evaluation=True,
+        duals=xp.concatenate([limit_duals, iterates.duals[:, limits:]], axis=1),
+        barrier=xp.full_like(iterates.barrier, stage.barrier),
+        step=xp.zeros_like(iterates.step),
+        length=xp.zeros_like(iterates.length),
+        needs_evaluation=xp.ones_like(iterates.needs_evaluation),
     )
 
 
 def _update(
     grid: Grid,
     stage: Stage,
-    iterate: Iterate,
+    iterates: Iterates,
     evaluation: Evaluation,
 ):
-    """Take the step of one start, or shorten it."""
-    slack = _cheapest_slack(stage, iterate, evaluation.excess)
-    room = _room(grid, stage, iterate.trial, evaluation, slack)
-    if iterate.needs_evaluation:
-        duals = iterate.barrier / room
-        limits = slice(2 * grid.c.size)
-        duals[limits] = iterate.duals[limits]
-        iterate = iterate._replace(
-            y=iterate.trial,
-            slack=slack,
-            evaluation=evaluation,
-            duals=duals,
-            refusals=0,
-            needs_evaluation=False,
-        )
-        return _with_step(grid, stage, iterate, room)
+    """Take the step of each start, or shorten it."""
+    xp = namespace(iterates.y)
+    slack = _cheapest_slack(stage, iterates, evaluation.excess)
+    room = room_of(grid, stage, iterates.trial, evaluation, slack)
+    present_room = room_of(grid, stage, iterates.y, iterates.evaluation, iterates.slack)
+    merit = _merit(stage, iterates, iterates.evaluation, iterates.slack, present_room)
+    trial_merit = _merit(stage, iterates, evaluation, slack, room)
+    promised_decrease = DECREASE * iterates.length * iterates.slope
+    rounding = 1e-10 * xp.abs(merit)
+    is_finite = xp.isfinite(evaluation.value)
+    is_finite &= xp.isfinite(evaluation.gradient).all(axis=1)
+    is_decrease = trial_merit <= merit + promised_decrease + rounding
 
-    present_room = _room(grid, stage, iterate.y, iterate.evaluation, iterate.slack)
-    merit = _merit(stage, iterate, iterate.evaluation, iterate.slack, present_room)
-    trial_merit = _merit(stage, iterate, evaluation, slack, room)
-    promised_decrease = DECREASE * iterate.length * iterate.slope
-    rounding = 1e-10 * abs(merit)
-    is_finite = math.isfinite(evaluation.value) and bool(
-        np.isfinite(evaluation.gradient).all()
+    is_first = iterates.needs_evaluation
+    is_step = ~is_first & is_finite & is_decrease
+    has_moved = is_first | is_step
+    is_forgotten = ~has_moved & (iterates.refusals >= PATIENCE)
+    first = _take_first(grid, iterates, slack, evaluation, room)
+    moved = _take_step(stage, iterates, slack, evaluation, room)
+    refused = _refuse_step(iterates, trial_merit - merit, is_forgotten)
+    points = select(is_step, moved, select(is_first, first, refused))
+
+    point_room = xp.where(has_moved[:, None], room, present_room)
+    points_with_steps = _with_steps(grid, stage, points, point_room)
+    return select(has_moved | is_forgotten, points_with_steps, points)
+
+
+def _take_first(
+    grid: Grid,
+    iterates: Iterates,
+    slack: Slacks,
+    evaluation: Evaluation,
+    room: Inequalities,
+):
+    """Return the iterates with the evaluation of the points where a stage begins."""
+    xp = namespace(iterates.y)
+    limits = 2 * grid.c.size
+    central_duals = iterates.barrier[:, None] / room[:, limits:]
+    return iterates._replace(
+        y=iterates.trial,
+        slack=slack,
+        evaluation=evaluation,
+        duals=xp.concatenate([iterates.duals[:, :limits], central_duals], axis=1),
+        refusals=xp.zeros_like(iterates.refusals),
+        needs_evaluation=xp.zeros_like(iterates.needs_evaluation),
     )
-    if is_finite and trial_merit <= merit + promised_decrease + rounding:
-        iterate = _take_step(stage, iterate, slack, evaluation, room)
-        return _with_step(grid, stage, iterate, room)
-    if iterate.refusals >= PATIENCE:
-        size = len(iterate.y)
-        mean_curvature = np.trace(iterate.curvature) / size
-        iterate = iterate._replace(curvature=np.eye(size) * mean_curvature, refusals=0)
-        return _with_step(grid, stage, iterate, present_room)
-    length = _shorter_length(iterate, trial_merit - merit)
-    return iterate._replace(length=length, refusals=iterate.refusals + 1)
 
 
-def _shorter_length(iterate: Iterate, increase: float):
-    """Return the length to the minimum of a parabola through the known merits."""
-    length = iterate.length
-    slope = iterate.slope
+def _refuse_step(iterates: Iterates, increase: PerStart, is_forgotten: AnyArray):
+    """Return the iterates with a shorter step, or without what curvature they have.
+
+    The length is that to the minimum of a parabola through the known merits.
+    """
+    xp = namespace(iterates.y)
+    length = iterates.length
+    slope = iterates.slope
     best_length = -slope * length**2 / (2 * (increase - slope * length))
-    if not math.isfinite(best_length):
-        return 0.1 * length
-    return float(np.clip(best_length, 0.1 * length, 0.5 * length))
+    shorter_length = xp.clip(best_length, 0.1 * length, 0.5 * length)
+    size = iterates.y.shape[1]
+    trace = xp.trace(iterates.curvature, axis1=1, axis2=2)
+    plain_curvature = (trace / size)[:, None, None] * np.eye(size)[None]
+    return iterates._replace(
+        curvature=select(is_forgotten, plain_curvature, iterates.curvature),
+        refusals=xp.where(is_forgotten, 0, iterates.refusals + 1),
+        length=xp.where(xp.isfinite(best_length), shorter_length, 0.1 * length),
+    )
 
 
 def _take_step(
     stage: Stage,
-    iterate: Iterate,
-    slack: np.ndarray,
+    iterates: Iterates,
+    slack: Slacks,
     evaluation: Evaluation,
     room: Inequalities,
 ):
-    """Return the iterate at the end of its step, with new multipliers and curvature.
+    """Return the iterates at the end of their steps: new multipliers and curvature.
 
     Args:
         stage: Run of the method.
-        iterate: Iterate before the step; `trial` is its point at the end of the step.
-        slack: Slack at that point.
-        evaluation: Objective and constraints at that point.
-        room: Distance of each inequality from its bound at that point.
+        iterates: Iterates before the step; `trial` are their points at its end.
+        slack: Slack at those points.
+        evaluation: Objective and constraints at those points.
+        room: Distance of each inequality from its bound at those points.
     """
+    xp = namespace(iterates.y)
     # After a short step the point is still far from the best one for this barrier.
-    barrier_factor = BARRIER_FACTOR if iterate.length > MIN_GOOD_LENGTH else 1.0
-    barrier = max(stage.min_barrier, iterate.barrier * barrier_factor)
-    duals = iterate.duals + iterate.dual_length * iterate.dual_step
-    duals = _clip_to_central_path(duals, barrier / room)
+    is_good = iterates.length > MIN_GOOD_LENGTH
+    lower_barrier = iterates.barrier * xp.where(is_good, BARRIER_FACTOR, 1.0)
+    barrier = xp.maximum(stage.min_barrier, lower_barrier)
+    duals = iterates.duals + iterates.dual_length[:, None] * iterates.dual_step
+    duals = _clip_to_central_path(duals, barrier[:, None] / room)
 
     # Curvature is that of the Lagrangian: of the value and of constraints that bend.
-    constraint_duals = _split(duals, evaluation).constraints
-    objective_change = evaluation.gradient - iterate.evaluation.gradient
-    slope_changes = evaluation.slopes - iterate.evaluation.slopes
-    gradient_change = objective_change + constraint_duals @ slope_changes
-    step = iterate.trial - iterate.y
-    curvature = _damped_bfgs(iterate.curvature, step, gradient_change)
-    return iterate._replace(
-        y=iterate.trial,
+    constraint_duals = split(duals, evaluation).constraints
+    objective_change = evaluation.gradient - iterates.evaluation.gradient
+    slope_changes = evaluation.slopes - iterates.evaluation.slopes
+    constraint_change = times(slope_changes.swapaxes(1, 2), constraint_duals)
+    step = iterates.trial - iterates.y
+    curvature = _damped_bfgs(
+        iterates.curvature, step, objective_change + constraint_change
+    )
+    return iterates._replace(
+        y=iterates.trial,
         slack=slack,
         evaluation=evaluation,
         duals=duals,
         curvature=curvature,
         barrier=barrier,
-        refusals=0,
+        refusals=xp.zeros_like(iterates.refusals),
     )
 
 
-def _with_step(
+def _with_steps(
     grid: Grid,
     stage: Stage,
-    iterate: Iterate,
+    iterates: Iterates,
     room: Inequalities,
 ):
-    """Return one start with the step to the barrier's minimum and its length."""
-    stiffness = iterate.duals / room
-    central_duals = iterate.barrier / room
-    descent = _descent(grid, stage, iterate, central_duals)
-    step = _solve(_barrier_hessian(grid, iterate, stiffness), descent)
-    change = _change_of_inequalities(grid, iterate, step)
-    dual_step = central_duals - iterate.duals + stiffness * change
-    return iterate._replace(
+    """Return the iterates with steps to the barrier's minimum and their lengths."""
+    stiffness = iterates.duals / room
+    central_duals = iterates.barrier[:, None] / room
+    descent = _descent(grid, stage, iterates, central_duals)
+    step = _solve(_barrier_hessian(grid, iterates, stiffness), descent)
+    change = _change_of_inequalities(grid, iterates, step)
+    dual_step = central_duals - iterates.duals + stiffness * change
+    return iterates._replace(
         step=step,
         dual_step=dual_step,
         length=_longest_step(change, room),
-        dual_length=_longest_step(-dual_step, iterate.duals),
-        slope=-float(descent @ step),
+        dual_length=_longest_step(-dual_step, iterates.duals),
+        slope=-dot(descent, step),
     )
 
 
 def _barrier_hessian(
     grid: Grid,
-    iterate: Iterate,
+    iterates: Iterates,
     stiffness: Inequalities,
 ):
     """Return the curvature of the objective with its barrier."""
-    slopes = iterate.evaluation.slopes
-    size = len(iterate.y)
-    parts = _split(stiffness, iterate.evaluation)
-    stiff_slopes = parts.constraints[:, None] * slopes
-    H = np.zeros((len(iterate.step), len(iterate.step)))
-    H[:size, :size] = iterate.curvature + slopes.T @ stiff_slopes
+    xp = namespace(iterates.y)
+    slopes = iterates.evaluation.slopes
+    size = iterates.y.shape[1]
+    parts = split(stiffness, iterates.evaluation)
+    stiff_slopes = parts.constraints[..., None] * slopes
+    H = iterates.curvature + slopes.swapaxes(1, 2) @ stiff_slopes
+    H = H + _limit_curvature(grid, parts.limits)
+    trace = xp.trace(H, axis1=1, axis2=2)
+    if parts.slack.shape[1]:
+        coupling = -stiff_slopes.sum(axis=1)
+        corner = parts.constraints.sum(axis=1) + parts.slack[:, 0]
+        upper_rows = xp.concatenate([H, coupling[:, :, None]], axis=2)
+        last_row = xp.concatenate([coupling, corner[:, None]], axis=1)
+        H = xp.concatenate([upper_rows, last_row[:, None]], axis=1)
+    ridge = RIDGE * trace / size
+    return H + ridge[:, None, None] * np.eye(H.shape[1])[None]
 
-    _add_limits(H, grid, parts.limits)
-    ridge = RIDGE * np.trace(H[:size, :size]) / size
-    if len(parts.slack):
-        coupling = -stiff_slopes.sum(axis=0)
-        H[:size, size] = coupling
-        H[size, :size] = coupling
-        H[size, size] = parts.constraints.sum() + parts.slack[0]
-    H[np.diag_indices(len(H))] += ridge
-    return H
 
-
-def _add_limits(H: np.ndarray, grid: Grid, stiffness: np.ndarray):
-    """Add the curvature of the limits, which couple the variables of one joint only."""
-    upper_stiffness, lower_stiffness = stiffness.reshape(2, *grid.c.shape)
-    stiff_rows = grid.R * (upper_stiffness + lower_stiffness)[:, :, None]
-    blocks = np.swapaxes(grid.R, 1, 2) @ stiff_rows
-    variables = grid.R.shape[2]
-    for joint, block in enumerate(blocks):
-        start = joint * variables
-        place = slice(start, start + variables)
-        H[place, place] += block
+def _limit_curvature(grid: Grid, stiffness: AnyArray):
+    """Return the curvature of the limits, which couple variables of one joint only."""
+    xp = namespace(stiffness)
+    sides = stiffness.reshape(-1, 2, *grid.c.shape)
+    stiffness_of_rows = sides.sum(axis=1)[..., None]
+    columns = np.swapaxes(grid.R, 1, 2)[None]
+    blocks = columns @ (grid.R[None] * stiffness_of_rows)
+    starts, joints, variables, _ = blocks.shape
+    is_own_joint = np.eye(joints)[None, :, None, :, None]
+    matrices = is_own_joint * blocks[:, :, :, None, :]
+    size = joints * variables
+    return xp.reshape(matrices, (starts, size, size))
 
 
 def _descent(
     grid: Grid,
     stage: Stage,
-    iterate: Iterate,
+    iterates: Iterates,
     central_duals: Inequalities,
 ):
     """Return the negative gradient of the objective with its barrier."""
-    evaluation = iterate.evaluation
-    parts = _split(central_duals, evaluation)
-    upper_parts, lower_parts = parts.limits.reshape(2, *grid.c.shape)
-    differences = upper_parts - lower_parts
-    limit_gradient = np.einsum("jrk,jr->jk", grid.R, differences).reshape(-1)
-    constraint_gradient = parts.constraints @ evaluation.slopes
+    xp = namespace(iterates.y)
+    evaluation = iterates.evaluation
+    parts = split(central_duals, evaluation)
+    sides = parts.limits.reshape(-1, 2, *grid.c.shape)
+    differences = sides[:, 0] - sides[:, 1]
+    joint_gradients = np.swapaxes(grid.R, 1, 2)[None] @ differences[..., None]
+    limit_gradient = joint_gradients.reshape(iterates.y.shape)
+    constraint_gradient = times(evaluation.slopes.swapaxes(1, 2), parts.constraints)
     descent = -(evaluation.gradient + limit_gradient + constraint_gradient)
-    if not len(parts.slack):
+    if not parts.slack.shape[1]:
         return descent
-    slack_descent = parts.constraints.sum() - stage.penalty + parts.slack
-    return np.concatenate([descent, slack_descent])
+    constraint_sum = parts.constraints.sum(axis=1, keepdims=True)
+    slack_descent = constraint_sum - stage.penalty + parts.slack
+    return xp.concatenate([descent, slack_descent], axis=1)
 
 
-def _solve(H: np.ndarray, downhill: np.ndarray):
-    """Return the Newton step; by the diagonal if rounding makes H indefinite."""
+def _solve(H: AnyArray, descent: Steps):
+    """Return the Newton steps; by the diagonal where rounding makes H indefinite."""
+    xp = namespace(H)
     try:
-        factor = scipy.linalg.cho_factor(H, lower=True, check_finite=False)
-        step = scipy.linalg.cho_solve(factor, downhill, check_finite=False)
+        step = xp.linalg.solve(H, descent[..., None])[..., 0]
     except np.linalg.LinAlgError:
-        step = np.full(len(H), np.nan)
-    return step if np.isfinite(step).all() else downhill / np.diagonal(H)
+        step = np.full(descent.shape, np.nan)
+    is_descent = xp.isfinite(step).all(axis=1) & (dot(descent, step) >= 0.0)
+    diagonal_step = descent / xp.diagonal(H, axis1=1, axis2=2)
+    return xp.where(is_descent[:, None], step, diagonal_step)
 
 
 def _change_of_inequalities(
     grid: Grid,
-    iterate: Iterate,
-    step: np.ndarray,
+    iterates: Iterates,
+    step: Steps,
 ):
     """Return by how much a step reduces the distance from each bound."""
-    size = len(iterate.y)
-    slack_step = step[size:]
-    rows = grid.rows(step[:size]).ravel()
-    constraint_changes = iterate.evaluation.slopes @ step[:size] - slack_step.sum()
-    return np.concatenate([rows, -rows, constraint_changes, -slack_step])
+    xp = namespace(step)
+    starts, size = iterates.y.shape
+    slack_step = step[:, size:]
+    rows = grid.rows(step[:, :size]).reshape(starts, -1)
+    constraint_changes = times(iterates.evaluation.slopes, step[:, :size])
+    constraint_changes = constraint_changes - slack_step.sum(axis=1, keepdims=True)
+    return xp.concatenate([rows, -rows, constraint_changes, -slack_step], axis=1)
 
 
-def _limit_room(grid: Grid, stage: Stage, y: np.ndarray):
-    """Return the distances from the limits of the joints."""
-    rows = (grid.rows(y) - grid.c).ravel()
-    bound = stage.bound * grid.bound
-    return np.concatenate([bound - rows, bound + rows])
-
-
-def _room(
-    grid: Grid,
-    stage: Stage,
-    y: np.ndarray,
-    evaluation: Evaluation,
-    slack: np.ndarray,
-):
-    """Return the distances from all bounds."""
-    limit_room = _limit_room(grid, stage, y)
-    return np.concatenate([limit_room, slack.sum() - evaluation.excess, slack])
-
-
-def _split(numbers: Inequalities, evaluation: Evaluation):
-    """Return the numbers of limits, constraints and slack."""
-    constraints = len(evaluation.excess)
-    slack = len(numbers) - (constraints > 0)
-    limits = slack - constraints
-    return Parts(numbers[:limits], numbers[limits:slack], numbers[slack:])
-
-
-def _clip_to_central_path(duals: np.ndarray, central_duals: np.ndarray):
+def _clip_to_central_path(duals: AnyArray, central_duals: AnyArray):
     """Return multipliers that are not too far from the central path."""
-    return np.clip(duals, central_duals / CENTRALITY, central_duals * CENTRALITY)
+    xp = namespace(duals)
+    return xp.clip(duals, central_duals / CENTRALITY, central_duals * CENTRALITY)
 
 
 def _longest_step(change: Inequalities, room: Inequalities):
     """Return the longest step, at most 1, that stays inside all bounds."""
-    return min(1.0, MAX_SHARE_OF_WAY / float((change / room).max(initial=1e-12)))
+    xp = namespace(change)
+    shares = (change / room).max(axis=1, initial=1e-12)
+    return xp.minimum(1.0, MAX_SHARE_OF_WAY / shares)
 
 
-def _damped_bfgs(B: np.ndarray, s: np.ndarray, change: np.ndarray):
+def _damped_bfgs(B: AnyArray, s: ScaledMotions, change: ScaledMotions):
     """Return the damped BFGS update, positive definite [1, procedure 18.2]."""
-    Bs = B @ s
-    expected_change = float(s @ Bs)
-    actual_change = float(s @ change)
-    if not expected_change > 1e-16:
-        return B
+    xp = namespace(B)
+    Bs = times(B, s)
+    expected_change = dot(s, Bs)
+    actual_change = dot(s, change)
     min_change = DAMPING * expected_change
-    damping = 1.0
-    if actual_change < min_change:
-        damping = (expected_change - min_change) / (expected_change - actual_change)
+    share = (expected_change - min_change) / (expected_change - actual_change)
+    damping = xp.where(actual_change < min_change, share, 1.0)[:, None]
     r = damping * change + (1.0 - damping) * Bs
-    update = B - np.outer(Bs, Bs / expected_change) + np.outer(r, r / (s @ r))
-    return update if np.isfinite(update).all() else B
+    update = B - outer(Bs) / expected_change[:, None, None]
+    update = update + outer(r) / dot(s, r)[:, None, None]
+    is_valid = (expected_change > 1e-16) & xp.isfinite(update).all(axis=(1, 2))
+    return select(is_valid, update, B)
 
 
 def _cheapest_slack(
     stage: Stage,
-    iterate: Iterate,
-    excess: ConstraintVector,
+    iterates: Iterates,
+    excess: AnyArray,
 ):
     """Return the slack of least cost, the barrier included.
 
     So a step may exceed a constraint that bends: the slack follows, and is penalised.
     """
-    if not len(iterate.slack):
-        return iterate.slack
-    barrier = iterate.barrier
+    if not iterates.slack.shape[1]:
+        return iterates.slack
+    xp = namespace(excess)
+    barrier = iterates.barrier[:, None]
     # From below, where the largest term alone balances the penalty, Newton's method
     # grows to it.
-    slack = max(0.0, float(excess.max())) + barrier / stage.penalty
+    largest_excess = excess.max(axis=1, keepdims=True)
+    slack = xp.maximum(0.0, largest_excess) + barrier / stage.penalty
     for _ in range(12):
-        room = np.append(slack - excess, slack)
-        slope = (barrier / room).sum() - stage.penalty
-        slack += max(0.0, slope / (barrier / room**2).sum())
-    return np.array([slack])
+        room = xp.concatenate([slack - excess, slack], axis=1)
+        slope = (barrier / room).sum(axis=1, keepdims=True) - stage.penalty
+        curvature = (barrier / room**2).sum(axis=1, keepdims=True)
+        slack = slack + xp.maximum(0.0, slope / curvature)
+    return slack
 
 
 def _merit(
     stage: Stage,
-    iterate: Iterate,
+    iterates: Iterates,
     evaluation: Evaluation,
-    slack: np.ndarray,
+    slack: Slacks,
     room: Inequalities,
 ):
     """Return the objective with penalty and barrier, which a step must decrease.
 
     `room` holds the distance of each inequality from its bound.
     """
+    xp = namespace(room)
     # A lower bound keeps the logarithms finite where a step meets a limit.
-    logarithms = [
-        float(np.log(np.maximum(part, 1e-300)).sum())
-        for part in _split(room, evaluation)
-    ]
-    penalty = stage.penalty * float(slack.sum())
-    return evaluation.value + penalty - iterate.barrier * sum(logarithms)
+    logarithms = xp.log(xp.maximum(room, 1e-300)).sum(axis=1)
+    penalty = stage.penalty * slack.sum(axis=1)
+    return evaluation.value + penalty - iterates.barrier * logarithms

@@ -26,11 +26,8 @@ from .coefficient_limits import JointLimits, ScaledMotion
 from .constraints import AbstractConstraint, Finding, LoopLimits
 from .criteria import AbstractCriterion, DOptimal, Information, information
 from .criteria.functions_of_eigenvalues import Scalar, Sharpness
-from .criteria.information_matrix import (
-    BaseMatrix,
-    JointVector,
-    gram_matrices,
-)
+from .criteria.information_matrix import BaseMatrix, JointVector
+from .criterion_gradient import criterion_value
 
 CHECKED_INSTANTS = 8160
 """Instants at which constraints are checked."""
@@ -128,7 +125,7 @@ class ExcitationProblem:
         self.checked_rows = np.asarray(self.basis.rows(instants)[:3])
         self._sample_rows: dict[int, np.ndarray] = {}
         self.criterion_and_slopes = jax.jit(
-            jax.value_and_grad(self._criterion_of, argnums=(0, 1))
+            jax.value_and_grad(self.criterion_of, argnums=(0, 1))
         )
         self.sizes = np.ones(base.size)
         self.sizes = self._typical_sizes()
@@ -168,24 +165,9 @@ class ExcitationProblem:
                 of them if None.
         """
         samples = self.samples if samples is None else samples
-        coefficients = self.limits.coefficients(jnp.asarray(x))[None]
-        motion = [
-            jnp.einsum("sk,bjk->jbs", part, coefficients)
-            for part in self.sample_rows(samples)
-        ]
-        columns = self.regressor(*motion)
-        plain_matrices, weighted_matrices = gram_matrices(
-            self.regressor, columns, self.weights
-        )
-        # The samples stand for all that are measured.
-        weight = self.samples / samples
-        return self._criterion_of(
-            weight * plain_matrices[0],
-            weight * weighted_matrices[0] + self.prior,
-            sharpness,
-        )
+        return criterion_value(self, samples, jnp.asarray(x), sharpness)
 
-    def _criterion_of(
+    def criterion_of(
         self,
         plain_matrix: Array,
         weighted_matrix: Array,

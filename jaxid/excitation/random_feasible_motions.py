@@ -13,7 +13,7 @@ from jaxid.arrays import Float
 from jaxid.dynamics.motion import Motion
 
 from .coefficient_limits import FILLED_FRACTION, Grid, ScaledMotions
-from .criterion_gradient import value_and_gradient
+from .criterion_gradient import criterion_at_samples
 from .feasible_candidates import Candidates
 from .problem import MARGIN, SEARCH_SAMPLES, WATCHED_INSTANTS, ExcitationProblem
 from .watched_constraints import watched_excess
@@ -50,8 +50,7 @@ class Draws(NamedTuple):
 
     def motions(self, sizes: Sizes) -> ScaledMotions:
         """Return the motions of these sizes."""
-        parts = zip(self.shapes, self.places, sizes, strict=True)
-        return np.array([self.grid.fill(*part) for part in parts])
+        return self.grid.fill(self.shapes, self.places, sizes)
 
 
 def random_feasible_motions(
@@ -70,7 +69,7 @@ def random_feasible_motions(
     places = _standing_poses(problem, random, number)
     shapes = random.standard_normal((number, problem.size))
     x = _enlarge(problem, Draws(problem.limits.grid(), shapes, places))
-    values, _ = value_and_gradient(problem, x, None, SEARCH_SAMPLES)
+    values = criterion_at_samples(problem, x, None, SEARCH_SAMPLES)
     motions = Candidates(x, values, watched_excess(problem, x) + MARGIN)
     return motions.at(motions.order()[:count])
 

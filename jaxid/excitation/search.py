@@ -8,25 +8,27 @@ keep them, so that there is a result after seconds.
 
 import math
 import time
-from collections.abc import Generator, Sequence
-from functools import partial
-from typing import NamedTuple
+from collections.abc import Callable, Generator
+from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
+
+from jaxid.arrays import AnyArray, namespace
 
 from . import interior_point
 from .coefficient_limits import ScaledMotions, scale_samples
-from .criterion_gradient import value_and_gradient
+from .criterion_gradient import criterion_at_samples, value_and_gradient
 from .feasible_candidates import (
     EXCESS_PENALTY,
     Candidates,
     evaluate_within_limits,
     shrink_to_constraints,
 )
-from .interior_point import Evaluation, Iterate, Stage
+from .interior_point_iterates import Evaluation, Iterates, Stage
 from .problem import MARGIN, SEARCH_SAMPLES, ExcitationProblem
 from .watched_constraints import (
-    WatchedValues,
     count_watched,
     linearise,
     watch,
@@ -171,7 +173,7 @@ def _improve_finely(
 
 def _find_feasible_motion(
     problem: ExcitationProblem,
-    x: np.ndarray,
+    x: ScaledMotions,
     candidates: Candidates,
 ) -> Search:
     """Look for a motion that keeps all constraints; return it as the first start."""
@@ -187,7 +189,7 @@ def _find_feasible_motion(
 
 def _improve_batch(
     problem: ExcitationProblem,
-    x: np.ndarray,
+    x: ScaledMotions,
     candidates: Candidates,
     places: np.ndarray,
     deadline: float,
@@ -219,7 +221,8 @@ def _improve_children(
 ) -> Search:
     """Improve one child of each motion; return the best of parents and children."""
     step = Step("combining and improving motions", candidates)
-    children = crossover(problem, np.asarray(candidates.x), random)
+    x = np.asarray(candidates.x)
+    children = crossover(problem, x, draw_matings(problem, len(x), random))
     motions = []
     for start in range(0, len(children), BATCH):
         iterates = _begin(problem, SEARCH_SAMPLES, children[start : start + BATCH])
@@ -231,8 +234,10 @@ def _improve_children(
             step,
             deadline,
         )
-        motions += [iterate.y for iterate in iterates]
-    return candidates.survivors(evaluate_within_limits(problem, np.array(motions)))
+        motions.append(iterates.y)
+    return candidates.survivors(
+        evaluate_within_limits(problem, np.concatenate(motions))
+    )
 
 
 def _begin(problem: ExcitationProblem, samples: int, x: ScaledMotions):
@@ -244,62 +249,97 @@ def _begin(problem: ExcitationProblem, samples: int, x: ScaledMotions):
 def _improve(
     problem: ExcitationProblem,
     samples: int,
-    iterates: list[Iterate],
+    iterates: Iterates,
     stage: Stage,
     step: Step,
     deadline: float = math.inf,
-) -> Generator[Step, None, list[Iterate]]:
+) -> Generator[Step, None, Iterates]:
     """Run one stage in parts; yield before each; return the iterates.
 
     The peaks of constraints are found anew for each part.
     """
     grid = problem.limits.grid(samples)
-    for start in range(0, stage.iterations, PART):
+    for part in split_stage(stage):
         yield step
         if time.monotonic() >= deadline:
             break
-        watched_values = [watch(problem, iterate.y) for iterate in iterates]
-        objective = partial(_evaluate, problem, stage.sharpness, watched_values)
+        objective = watched_objective(problem, iterates.y, part.sharpness)
+        iterates = interior_point.run(grid, objective, iterates, part)
+    return iterates
+
+
+def split_stage(stage: Stage) -> list[Stage]:
+    """Return the parts of a stage."""
+    parts = []
+    for start in range(0, stage.iterations, PART):
         barrier = stage.barrier * interior_point.BARRIER_FACTOR**start
         part = stage._replace(
             barrier=max(stage.min_barrier, barrier),
             iterations=min(PART, stage.iterations - start),
         )
-        iterates = interior_point.run(grid, objective, iterates, part)
-    return iterates
+        parts.append(part)
+    return parts
 
 
-def _evaluate(
-    problem: ExcitationProblem,
-    sharpness: float,
-    watched_values: Sequence[list[WatchedValues]],
-    y: ScaledMotions,
-    starts: Sequence[int],
-):
-    """Return criterion and constraints at points of these starts."""
+def watched_objective(
+    problem: ExcitationProblem, x: ScaledMotions, sharpness: Any
+) -> Callable[[ScaledMotions], Evaluation]:
+    """Return the function that evaluates criterion and constraints near motions."""
+    watched_values = watch(problem, x) if problem.constraints else []
     samples = scale_samples(SEARCH_SAMPLES, problem.basis)
-    values, gradients = value_and_gradient(problem, y, sharpness, samples)
-    constraints = linearise(problem, y, [watched_values[start] for start in starts])
-    excess = constraints.values + MARGIN
-    parts = (values.tolist(), gradients, excess, constraints.slopes)
-    return [Evaluation(*fields) for fields in zip(*parts, strict=True)]
+
+    def evaluate(y):
+        values, gradients = value_and_gradient(problem, y, sharpness, samples)
+        constraints = linearise(problem, y, watched_values)
+        excess = constraints.values + MARGIN
+        return Evaluation(values, gradients, excess, constraints.slopes)
+
+    return evaluate
 
 
 def _take(
     problem: ExcitationProblem,
     candidates: Candidates,
     places: np.ndarray,
-    iterates: list[Iterate],
+    iterates: Iterates,
 ):
     """Return the best motions, with those of iterates at some places if better."""
-    x = np.array([iterate.y for iterate in iterates])
-    return candidates.improved(places, evaluate_within_limits(problem, x))
+    found_motions = evaluate_within_limits(problem, iterates.y)
+    return candidates.improved(places, found_motions)
+
+
+class Mating(NamedTuple):
+    """Random choices by which each motion has one child."""
+
+    mates: AnyArray  # place of the second parent
+    retimings: AnyArray  # number of the second parent's change of time
+    is_from_second: AnyArray  # [starts, joints]
+
+
+def draw_matings(
+    problem: ExcitationProblem, starts: int, random: np.random.Generator
+) -> Mating:
+    """Draw the choices of several children of each motion, tries first."""
+    joints, _ = problem.limits.shape
+    shape = (CHILD_TRIES, starts)
+    mates = np.arange(starts) + random.integers(1, max(starts, 2), shape)
+    numbers = random.integers(0, len(problem.basis.retimings()), shape)
+    # Half of the second parents are not retimed: motions of one descent fit together
+    # already.
+    numbers[random.random(shape) < 0.5] = 0
+
+    # A child has this expected fraction of joints from its second parent, and at least
+    # one.
+    fractions = random.uniform(0.1, 0.5, (*shape, 1))
+    is_from_second = random.random((*shape, joints)) < fractions
+    certain_joints = random.integers(0, joints, shape)
+    joint_numbers = np.arange(joints)
+    is_from_second |= certain_joints[..., None] == joint_numbers
+    return Mating(mates % starts, numbers, is_from_second)
 
 
 def crossover(
-    problem: ExcitationProblem,
-    x: ScaledMotions,
-    random: np.random.Generator,
+    problem: ExcitationProblem, x: ScaledMotions, matings: Mating
 ) -> ScaledMotions:
     """Return one child of each motion with another one: the most promising of several.
 
@@ -309,49 +349,39 @@ def crossover(
     period begins or which way it runs, so that two good motions may fit together at one
     shift only: many children are tried.
     """
-    retimings = problem.basis.retimings()
+    xp = namespace(x)
+    retimings = np.asarray(problem.basis.retimings())
     samples = scale_samples(SEARCH_SAMPLES, problem.basis)
-    next_motions = np.array(x)
-    best_values = np.full(len(x), np.inf)
-    for _ in range(CHILD_TRIES):
-        children = _draw_children(problem, retimings, x, random)
-        values, _ = value_and_gradient(problem, children, None, samples)
+
+    def try_children(mating):
+        children = _children(problem, retimings, x, mating)
+        values = criterion_at_samples(problem, children, None, samples)
         if problem.constraints:
             excess = watched_excess(problem, children)
-            values = values + EXCESS_PENALTY * np.maximum(excess, 0.0)
-        is_better = values < best_values
-        next_motions[is_better] = children[is_better]
-        best_values[is_better] = values[is_better]
-    return next_motions
+            values = values + EXCESS_PENALTY * xp.maximum(excess, 0.0)
+        return children, xp.where(xp.isnan(values), np.inf, values)
+
+    if xp is jnp:
+        children, values = jax.lax.map(try_children, matings)
+    else:
+        tries = [try_children(Mating(*parts)) for parts in zip(*matings, strict=True)]
+        children, values = (np.stack(parts) for parts in zip(*tries, strict=True))
+    return children[values.argmin(axis=0), np.arange(len(x))]
 
 
-def _draw_children(
-    problem: ExcitationProblem,
-    retimings: np.ndarray,
-    x: np.ndarray,
-    random: np.random.Generator,
+def _children(
+    problem: ExcitationProblem, retimings: np.ndarray, x: ScaledMotions, mating: Mating
 ):
-    """Draw one child of each motion with another one."""
+    """Return one child of each motion with another one."""
+    xp = namespace(x)
     starts = len(x)
     joints, variables = problem.limits.shape
-    numbers = np.arange(starts)
-    offsets = random.integers(1, max(starts, 2), starts)
-
-    # Half of the second parents are not retimed: motions of one descent fit together
-    # already.
-    retiming_numbers = random.integers(0, len(retimings), starts)
-    is_unchanged = random.random(starts) < 0.5
-    maps = retimings[np.where(is_unchanged, 0, retiming_numbers)]
-    coefficients = problem.limits.coefficients(x[(numbers + offsets) % starts])
-    retimed_mates = np.einsum("bvw,bjw->bjv", maps, coefficients)
-    second_parents = retimed_mates / np.asarray(problem.limits.scale)
-
-    # A child has this expected fraction of joints from its second parent, and at least
-    # one.
-    fractions = random.uniform(0.1, 0.5, (starts, 1))
-    is_from_second = random.random((starts, joints)) < fractions
-    is_from_second[numbers, random.integers(0, joints, starts)] = True
-
+    maps = xp.asarray(retimings)[mating.retimings]
+    coefficients = problem.limits.coefficients(x[mating.mates])
+    # [starts, joints, coefficients] @ [starts, coefficients, coefficients]
+    retimed_mates = coefficients @ maps.swapaxes(1, 2)
+    second_parents = retimed_mates / np.asarray(problem.limits.scale)[None]
     first_parents = x.reshape(starts, joints, variables)
-    children = np.where(is_from_second[:, :, None], second_parents, first_parents)
+    is_from_second = mating.is_from_second[:, :, None]
+    children = xp.where(is_from_second, second_parents, first_parents)
     return children.reshape(x.shape)

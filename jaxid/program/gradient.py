@@ -5,8 +5,10 @@ import math
 from collections.abc import Callable
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
+from jaxid.arrays import AnyArray, namespace
 from jaxid.errors import InputError
 
 from .numpy_evaluation import evaluate
@@ -23,6 +25,7 @@ from .scalar import (
     negate,
     select,
 )
+from .xla_sample_blocks import packed_columns
 
 _DERIVATIVES: dict[Operation, Callable[[Operand, Operand], Operand]] = {
     Operation.ABSOLUTE: lambda x, y: apply(Operation.SIGN, x),
@@ -46,17 +49,19 @@ _DERIVATIVES: dict[Operation, Callable[[Operand, Operand], Operand]] = {
 """Derivatives of functions of one argument, by argument and result."""
 
 
-def pull_back(
-    program: Program, weights: np.ndarray, *arrays: np.ndarray
-) -> list[np.ndarray]:
+def pull_back(program: Program, weights: AnyArray, *arrays: AnyArray) -> list[AnyArray]:
     """Return the derivative of a weighted sum of results by each input.
 
     Args:
         program: Program whose results are weighted.
-        weights: Weights of the packed result, [results, *batch].
+        weights: Weights of the packed result, [results, *batch], in NumPy or JAX.
         arrays: Inputs of the program; batch axes follow those of each input.
     """
-    return list(evaluate(gradient_program(program), *arrays, weights))
+    derivative = gradient_program(program)
+    if namespace(weights, *arrays) is np:
+        return list(evaluate(derivative, *arrays, weights))
+    jax_arrays = [jnp.asarray(x) for x in (*arrays, weights)]
+    return list(derivative.unpack(packed_columns(derivative, *jax_arrays)))
 
 
 @functools.lru_cache(maxsize=64)

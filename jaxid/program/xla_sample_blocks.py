@@ -19,7 +19,7 @@ from jax.custom_batching import custom_vmap
 from jaxid.arrays import Array, Float
 
 from .gpu_kernel import in_kernel, suits_kernel
-from .jax_transformation_rules import TRUE, differing_alike
+from .jax_transformation_rules import TRUE, differing_alike, with_derivatives_of
 from .program import Program
 from .xla import Results, fenced, hidden_one, lower
 from .xla_loops import empty_rows, entry_rows, rows_of
@@ -174,6 +174,15 @@ def on_rows(program: Program, *arrays: Array) -> Rows:
         return run(*rows).reshape(size, count, -1), True
 
     return run(*differing_alike(arrays))
+
+
+def packed_columns(program: Program, *arrays: Array) -> Array:
+    """Return the packed result [out, *batch] of arrays whose batch axes stand last."""
+    batch = arrays[0].shape[1:]
+    definition = functools.partial(_pack, results_at_once, program)
+    run = with_derivatives_of(definition, functools.partial(on_rows, program))
+    rows = [x.reshape(len(x), -1).T for x in arrays]
+    return run(*rows).T.reshape(-1, *batch)
 
 
 def _one_after_the_other(run: Callable, inputs: list[tuple[Array, bool]]):

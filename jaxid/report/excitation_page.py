@@ -10,6 +10,7 @@ from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.io import write_text
 from jaxid.result_table import Remark, Status, significant, sort_remarks
 from jaxid.robot.collision import CollisionModel
+from jaxid.robot.limits_and_drives import listed
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from .motion_figures import joint_figure, speed_figure
@@ -54,13 +55,15 @@ def _assumed_limits(plan: ExcitationPlan) -> str:
     """Return the limits that were assumed, with their values and joints."""
     robot = plan.base.model.robot
     rate_units = {"velocity": "/s", "acceleration": "/s²"}
-    texts = []
+    joints_by_limit: dict[str, list[str]] = {}
     for name, j in plan.limits.assumed:
         values = getattr(plan.limits.limits, name)
         value = float(values[j])
         unit = f"{robot.joint_unit(j)}{rate_units.get(name, '')}"
-        joint = robot.joint_names[j]
-        texts.append(f"{name} of `{joint}` ({value:.4g} {unit})")
+        # Joints with the same value are named together.
+        limit = f"{name} {value:.4g} {unit}"
+        joints_by_limit.setdefault(limit, []).append(robot.joint_names[j])
+    texts = [f"{limit} of {listed(x)}" for limit, x in joints_by_limit.items()]
     return ", ".join(texts)
 
 

@@ -30,6 +30,7 @@ class UnreadShapes(NamedTuple):
 
     body: int  # -1 is the ground
     reason: str
+    has_no_file: bool  # whether the file of a mesh was not found
 
 
 def fit_capsules(
@@ -142,7 +143,8 @@ def placed_shapes(
         except (OSError, InputError) as error:
             if faults is None:
                 raise
-            faults[link] = UnreadShapes(body, str(error))
+            has_no_file = isinstance(error, FileNotFoundError)
+            faults[link] = UnreadShapes(body, str(error), has_no_file)
             shapes = []
         yield LinkShapes(link, body, rotation, position, shapes)
 

@@ -153,16 +153,21 @@ def fit_links(
         **robot_file.chain,
         **robot_file.placement,
     )
-    # Links with the same fault share a sentence.
-    links_by_fault: dict[str, list[str]] = {}
+    # Links with the same fault share a sentence, and so do all without their meshes.
+    faults_by_kind: dict[str | bool, dict[str, UnreadShapes]] = {}
     for link, fault in faults.items():
         if fault.body not in known_bodies:
-            links_by_fault.setdefault(fault.reason, []).append(link)
-    sentences = [
-        f"{owners('link', names)}: geometry not read ({reason.rstrip('.')}); give "
-        "`capsules` of this body in `[collision]`, or the file"
-        for reason, names in links_by_fault.items()
-    ]
+            kind = fault.has_no_file or fault.reason
+            faults_by_kind.setdefault(kind, {})[link] = fault
+    sentences = []
+    for alike_faults in faults_by_kind.values():
+        reasons = [fault.reason.rstrip(".") for fault in alike_faults.values()]
+        others = len(set(reasons)) - 1
+        note = f"; {others} more like it" if others else ""
+        sentences.append(
+            f"{owners('link', [*alike_faults])}: geometry not read ({reasons[0]}"
+            f"{note}); give `capsules` of this body in `[collision]`, or the file"
+        )
     return list(capsules), sentences
 
 

@@ -61,7 +61,9 @@ def checked(problem, x):
 
 
 @pytest.mark.parametrize("criterion", CRITERIA.values(), ids=CRITERIA)
-def test_gradients_without_a_compiler_are_those_of_jax(pendulum, criterion):
+def test_gradients_are_central_differences_with_and_without_a_compiler(
+    pendulum, criterion
+):
     one = ExcitationProblem(
         pendulum, BASIS, criterion=criterion, noise=np.ones(1), samples=100
     )
@@ -73,11 +75,18 @@ def test_gradients_without_a_compiler_are_those_of_jax(pendulum, criterion):
         np.testing.assert_allclose(values, expected[0], rtol=1e-11)
         size = np.abs(expected[1]).max()
         np.testing.assert_allclose(gradients, expected[1], atol=1e-9 * size)
+        quotients = np.zeros_like(gradients)
+        for k, step in enumerate(1e-5 * np.eye(x.shape[1])):
+            sides = [
+                value_and_gradient(one, x + s * step, sharpness, 64) for s in (1, -1)
+            ]
+            quotients[:, k] = (sides[0][0] - sides[1][0]) / 2e-5
+        np.testing.assert_allclose(gradients, quotients, atol=1e-6 * size)
 
 
 def test_derivatives_are_central_differences(problem):
     x = np.asarray(problem.limits.random(jax.random.key(2), 2))
-    watched = [watch(problem, y) for y in x]
+    watched = watch(problem, x)
     values, slopes = linearise(problem, x, watched)
     assert slopes.shape == (2, count_watched(problem), x.shape[1])
     assert values.shape[1] == (len(WATCHED_INSTANTS) + PEAKS) * 3
@@ -121,7 +130,7 @@ def test_the_highest_peaks_are_watched(problem):
     x = problem.limits.random(jax.random.key(4), 1)[0]
     values = checked(problem, x)
     assert values.shape == (CHECKED_INSTANTS, 3)
-    (found,) = linearise(problem, x[None], [watch(problem, x)])[0]
+    (found,) = linearise(problem, x[None], watch(problem, x[None]))[0]
     found = found.reshape(3, -1).max(axis=1)
     np.testing.assert_allclose(found, values[::COARSE_STEP].max(axis=0), atol=1e-9)
     at_watched_instants = values[WATCHED_INSTANTS].max()

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from jaxid.excitation.compiled_search import CompiledSearch
 from jaxid.excitation.constraints import AbstractConstraint, Finding
 from jaxid.excitation.criteria import ConditionNumber, DOptimal, information
 from jaxid.excitation.design import design_excitation, minimise
@@ -17,7 +18,7 @@ from jaxid.report.excitation_page import motion_verdict
 from jaxid.result_table import Status
 from jaxid.trajectory.fourier import FourierBasis
 
-EFFORT = {"starts": 3, "generations": 1}
+EFFORT = {"starts": 6, "generations": 1}
 BASIS = FourierBasis(2, 1.1)
 
 
@@ -156,6 +157,45 @@ def test_another_solver_is_put_around_a_problem(free):
     before, after = found.history
     assert after < before
     assert after == pytest.approx(found.criterion.value(found.information))
+
+
+@pytest.mark.parametrize("bound", [np.inf, 0.4])
+def test_the_compiled_search_finds_what_the_search_in_numpy_finds(
+    free, plan, pendulum, bound
+):
+    arguments = {"starts": 6, "key": jax.random.key(3)}
+    problem = free
+    if np.isfinite(bound):
+        problem = ExcitationProblem(pendulum, BASIS, constraints=(LowTip(bound),))
+        plan = minimise(problem, generations=1, **arguments)
+    compiled = minimise(problem, CompiledSearch(generations=1), **arguments)
+    assert plan.feasible
+    assert compiled.feasible
+    assert compiled.history[-1] == pytest.approx(plan.history[-1], rel=0.02)
+    if np.isfinite(bound):
+        assert compiled.findings[0].value > -0.02, "the constraint binds"
+
+
+def test_the_whole_search_is_one_program_for_a_gpu(free):
+    search = CompiledSearch(generations=1)
+    program = search.program(free, 2, np.random.default_rng(0))
+    starts = free.limits.random(jax.random.key(3), 2)
+    traced = jax.jit(program).trace(starts)
+    text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    assert "stablehlo.while" in text
+    assert "cusolver" in text, "its linear systems are solved on the device"
+    assert "callback" not in text
+
+
+def test_a_gpu_is_used_where_there_is_one(free, monkeypatch):
+    """Progress, a limited time, and motions to go on with, as without a GPU."""
+    monkeypatch.setattr("jax.default_backend", lambda: "gpu")
+    seen = []
+    arguments = {"key": jax.random.key(3), "starts": 2, "generations": 0}
+    plan = minimise(free, progress=seen.append, seconds=4.0, **arguments)
+    assert plan.feasible
+    assert all(after.best <= before.best for before, after in itertools.pairwise(seen))
+    assert plan.history[-1] == pytest.approx(plan.criterion.value(plan.information))
 
 
 def test_the_problems_functions_are_those_of_the_motion(impossible, pendulum):

@@ -1,11 +1,13 @@
 """The interior point method against scipy on convex problems whose limits bind."""
 
+import jax
 import numpy as np
 import scipy.optimize
 
+from jaxid.arrays import namespace
 from jaxid.excitation import interior_point
 from jaxid.excitation.coefficient_limits import JointLimits
-from jaxid.excitation.interior_point import Evaluation, Stage
+from jaxid.excitation.interior_point_iterates import Evaluation, Stage
 from jaxid.trajectory.fourier import FourierBasis
 
 RANDOM = np.random.default_rng(0)
@@ -20,17 +22,27 @@ def problem(arm):
 
 
 def solved(limits, objective, *stages, constraints=0):
+    """Return iterates in NumPy, after a comparison with those in JAX; and the rows."""
     grid, size = limits.grid(64), limits.scale.size
-    states = interior_point.begin(
-        grid, 0.1 * RANDOM.standard_normal((3, size)), constraints
+    starts = 0.1 * RANDOM.standard_normal((3, size))
+
+    def every(points):
+        evaluations = [objective(y) for y in points]
+        return Evaluation(
+            *(namespace(points).stack(x) for x in zip(*evaluations, strict=True))
+        )
+
+    def run(y):
+        states = interior_point.begin(grid, y, constraints)
+        for bound, barrier, least, iterations in stages:
+            stage = Stage(bound, barrier, least, iterations, penalty=100.0)
+            states = interior_point.run(grid, every, states, stage)
+        return states
+
+    states, compiled = run(starts), jax.jit(run)(starts)
+    np.testing.assert_allclose(
+        compiled.evaluation.value, states.evaluation.value, rtol=1e-4
     )
-
-    def every(points, _):
-        return [objective(y) for y in points]
-
-    for bound, barrier, least, iterations in stages:
-        stage = Stage(bound, barrier, least, iterations, penalty=100.0)
-        states = interior_point.run(grid, every, states, stage)
     rows = np.zeros((*grid.c.shape, 2, limits.shape[1]))
     for j in range(2):
         rows[j, :, j] = grid.R[j]
@@ -65,10 +77,8 @@ def test_reaches_the_constrained_minimum_from_every_start(arm):
     )
     best = by_scipy(wish, H, G, c, bound)
     assert best.success
-    np.testing.assert_allclose(
-        [x.evaluation.value for x in states], best.fun, rtol=1e-4
-    )
-    assert (np.abs(np.array([x.y for x in states]) @ G.T - c) <= bound).all()
+    np.testing.assert_allclose(states.evaluation.value, best.fun, rtol=1e-4)
+    assert (np.abs(states.y @ G.T - c) <= bound).all()
 
 
 def curved(wish, H, radii):
@@ -77,7 +87,7 @@ def curved(wish, H, radii):
     places = 0.3 * RANDOM.standard_normal((len(radii), size))
 
     def objective(y):
-        away, from_places = y - wish, y - places
+        away, from_places = y - wish, y[None] - places
         return Evaluation(
             0.5 * away @ H @ away,
             H @ away,
@@ -102,11 +112,9 @@ def test_keeps_constraints_that_are_not_linear(arm):
     best = by_scipy(wish, H, G, c, bound, ball)
     assert best.success
     assert best.fun > 1.02 * by_scipy(wish, H, G, c, bound).fun, "the ellipsoids bind"
-    np.testing.assert_allclose(
-        [x.evaluation.value for x in states], best.fun, rtol=1e-4
-    )
-    assert max(x.evaluation.excess.max() for x in states) <= 1e-6
-    assert (np.abs(np.array([x.y for x in states]) @ G.T - c) <= bound).all()
+    np.testing.assert_allclose(states.evaluation.value, best.fun, rtol=1e-4)
+    assert states.evaluation.excess.max() <= 1e-6
+    assert (np.abs(states.y @ G.T - c) <= bound).all()
 
 
 def test_what_cannot_be_kept_is_exceeded_as_little_as_can_be(arm):
@@ -131,5 +139,5 @@ def test_what_cannot_be_kept_is_exceeded_as_little_as_can_be(arm):
     )
     assert least.success
     assert least.fun > 0.5
-    found = [x.evaluation.excess.max() for x in states]
+    found = states.evaluation.excess.max(axis=1)
     np.testing.assert_allclose(found, least.fun, rtol=1e-2)

@@ -2,7 +2,7 @@
 
 import math
 from abc import abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
@@ -85,7 +85,7 @@ class Finding(NamedTuple):
 
 
 ValuesAndSlopes = tuple[
-    Float[np.ndarray, " samples"], list[Float[np.ndarray, "samples joints"]]
+    Float[AnyArray, " samples"], Sequence[Float[AnyArray, "samples joints"]]
 ]
 """One value of each sample, and its derivatives by q, qd, qdd.
 
@@ -130,12 +130,8 @@ class AbstractConstraint(eqx.Module):
 
         @jax.jit
         def linearise_block(entries, *motion):
-            def value(*motion):
-                values = self(robot, Motion(*motion))
-                return jnp.take_along_axis(values, entries[:, None], axis=1)[:, 0]
-
-            values, pull = jax.vjp(value, *motion)
-            return values, *pull(jnp.ones_like(values))
+            values, slopes = linearise_values(self, robot, Motion(*motion), entries)
+            return values, *slopes
 
         def linearise(motion, entries):
             arrays = (entries, motion.q, motion.qd, motion.qdd)
@@ -150,6 +146,19 @@ class AbstractConstraint(eqx.Module):
         peaks = np.asarray(values).reshape(-1, len(entries)).max(axis=0)
         pairs = zip(entries, peaks.tolist(), strict=True)
         return [entry._replace(value=peak) for entry, peak in pairs]
+
+
+def linearise_values(
+    constraint: AbstractConstraint, robot: Robot, motion: Motion, entries: AnyArray
+) -> ValuesAndSlopes:
+    """Return the value of one entry at each sample, and its derivatives, in JAX."""
+
+    def value(*motion):
+        values = constraint(robot, Motion(*motion))
+        return jnp.take_along_axis(values, entries[:, None], axis=1)[:, 0]
+
+    values, pull = jax.vjp(value, motion.q, motion.qd, motion.qdd)
+    return values, list(pull(jnp.ones_like(values)))
 
 
 def in_blocks(function: Callable, *arrays: AnyArray) -> list[np.ndarray]:
@@ -175,4 +184,6 @@ def pull_back_samples(
     program = program_of(owner, method, *(x.shape[1:] for x in samples))
     packed_weights = weights.reshape(len(weights), -1).T
     columns = [np.asarray(x).T for x in samples]
-    return [slopes.T for slopes in pull_back(program, packed_weights, *columns)]
+    return [
+        np.asarray(slopes).T for slopes in pull_back(program, packed_weights, *columns)
+    ]
