@@ -21,6 +21,8 @@ motion over those in this motion, and of that the mean over 15 random motions
 * step: one value and gradient against forward differences of the same function, 800
   samples.
 * batch: starts per second of a whole search.
+* compiled: `CompiledSearch` with one generation, compiling and running apart, beside
+  the search in NumPy from the same starts.
 
 Median and best of the keys. CPU seconds are those of the process; the first key's
 compile.
@@ -259,14 +261,44 @@ def batch(sizes):
         print(f"batch of {starts}: {rate} ({wall:.2f} s, CPU {cpu:.2f} s)", flush=True)
 
 
+def compiled(starts):
+    """Time the search as one program, and compare it with the search in NumPy."""
+    base = base_of(True)
+    problem = jid.ExcitationProblem(base)
+    search = jid.excitation.CompiledSearch(generations=1)
+    x = problem.limits.random(jax.random.key(0), starts)
+    program = jax.jit(search.program(problem, starts, np.random.default_rng(0)))
+
+    def timed(function):
+        cpu = time.process_time()
+        result = jax.block_until_ready(function())
+        return result, time.process_time() - cpu
+
+    lowered, lowering = timed(lambda: program.lower(x))
+    run, compiling = timed(lowered.compile)
+    better, running = timed(lambda: run(x))
+    ours, _ = timed(lambda: jid.excitation.minimise(problem, lambda *_: better))
+    plan, numpy = timed(
+        lambda: jid.excitation.minimise(problem, starts=starts, generations=1)
+    )
+    gains = [Evaluation([base]).gains(p.trajectory)[0] for p in (ours, plan)]
+    print(
+        f"compiled, {starts} starts: CPU {lowering + compiling:.1f} s to compile, "
+        f"{running:.1f} s to run, gain {gains[0]:.3f}; "
+        f"in NumPy {numpy:.1f} s, gain {gains[1]:.3f}",
+        flush=True,
+    )
+
+
 FREE = ("cond", "d7", "d10", "panda")
+SPEED = ("step", "batch", "compiled")
 KEPT = ("capsules-cond", "capsules-d", "rest", "forces", "free")
 
 
 def main():
     """Run the selected parts."""
     parser = timing.parser(__doc__, "d7 and rest with two starts, step")
-    parser.add_argument("parts", nargs="*", default=[*FREE, *KEPT, "step", "batch"])
+    parser.add_argument("parts", nargs="*", default=[*FREE, *KEPT, *SPEED])
     parser.add_argument("--keys", type=int, default=3)
     parser.add_argument("--first", type=int, default=0, help="the first key")
     parser.add_argument("--starts", type=int, default=32)
@@ -284,6 +316,8 @@ def main():
             constrained(part, keys, options)
         elif part == "step":
             step()
+        elif part == "compiled":
+            compiled(2 if options.quick else options.starts)
         else:
             batch((1, 8, 64) if jax.default_backend() == "cpu" else (64, 512, 4096))
 
