@@ -1,6 +1,7 @@
 """Public names of `jaxid`, in the order of the pipeline; loaded when they are used."""
 
 from . import (
+    calibration as calibration,
     dynamics as dynamics,
     excitation as excitation,
     experiment as experiment,
@@ -12,6 +13,7 @@ from . import (
     units as units,
     workflow as workflow,
 )
+from .calibration.calibrate import calibrate as calibrate
 from .dynamics import terms as terms
 from .dynamics.base import (
     BaseParameters as BaseParameters,

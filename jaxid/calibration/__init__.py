@@ -1,0 +1,15 @@
+"""Kinematic calibration: the geometry of a robot from poses in several sessions."""
+
+from .calibrate import rough_bodies as rough_bodies
+from .error_derivatives import corrected_robot as corrected_robot
+from .geometry_fit import GeometryChange as GeometryChange, GeometryFit as GeometryFit
+from .observations import (
+    OBSERVATIONS as OBSERVATIONS,
+    AbstractObservation as AbstractObservation,
+    KnownDistance as KnownDistance,
+    MeasuredPose as MeasuredPose,
+    MeasuredPosition as MeasuredPosition,
+    PlaneContact as PlaneContact,
+    PointContact as PointContact,
+    SocketDistance as SocketDistance,
+)

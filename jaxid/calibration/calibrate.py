@@ -1,0 +1,106 @@
+"""Kinematic calibration: from observations to the geometry of a robot."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.arrays import Numbers, as_finite_array
+from jaxid.errors import InputError
+from jaxid.robot.inertia import BodyParameters, Inertia
+from jaxid.robot.robot import Robot
+from jaxid.robot.urdf import urdf_parameters
+
+from .geometry_fit import GeometryFit
+from .observations import AbstractObservation
+from .problem import build_problem
+from .solution import solve
+
+NO_MASSES = (
+    "Compliance was left out, because the masses of the robot are not known: give "
+    "`bodies`, for which rough masses suffice (`jid.calibration.rough_bodies`)"
+)
+
+
+def calibrate(
+    robot: Robot,
+    observations: Sequence[AbstractObservation],
+    *,
+    bodies: Numbers | None = None,
+    compliance: bool = True,
+) -> GeometryFit:
+    """Find the true geometry of a robot from observations in several sessions.
+
+    Unknown are shift and turn of each joint's origin (with the joint's zero), the
+    deflection of each joint under gravity, and where tools and places are. What the
+    poses do not determine stays as near to the nominal geometry as a prior says, which
+    is chosen by leaving sessions out. Poses that do not belong to the others are left
+    out. Intervals take the session as the unit.
+
+    Args:
+        robot: Nominal robot.
+        observations: Observations of all sessions.
+        bodies: Inertial parameters of the bodies, ten each, for the torques of gravity;
+            those of the robot's file if None.
+        compliance: Whether joints deflect under gravity.
+
+    Raises:
+        InputError: If there is no observation, or coordinates do not fit the robot.
+    """
+    if not observations:
+        raise InputError("`observations` must hold at least one observation.")
+    for observation in observations:
+        joints = observation.q.shape[1]
+        if observation.has_poses and joints != robot.joints:
+            raise InputError(
+                f"`q` of the session `{observation.session}` must have "
+                f"{robot.joints} columns, one for each joint of `{robot.name}`, but "
+                f"has {joints}."
+            )
+    parameters = None
+    if compliance:
+        parameters = _bodies_of_file(robot) if bodies is None else bodies
+    if parameters is not None:
+        numbers = np.reshape(np.asarray(parameters, np.float64), (-1, 10))
+        as_finite_array("`bodies`", numbers, (robot.bodies, 10))
+        parameters = numbers
+    problem = build_problem(robot, observations, parameters)
+    notes = (NO_MASSES,) if compliance and parameters is None else ()
+    session_weights = np.ones(len(problem.sessions))
+    has_compliance = parameters is not None
+    solution = solve(problem, session_weights, has_compliance)
+    return GeometryFit(problem, solution, has_compliance, notes)
+
+
+def _bodies_of_file(robot: Robot) -> BodyParameters | None:
+    """Return the bodies that the robot's file describes; None if it has no masses."""
+    if not Path(robot.source).is_file():
+        return None
+    bodies = urdf_parameters(
+        robot.source,
+        tip=robot.source_tip,
+        base=robot.source_base,
+        xacro_arguments=dict(robot.source_arguments) or None,
+        check=False,
+    )
+    return np.reshape(bodies, (-1, 10)) if np.any(bodies) else None
+
+
+def rough_bodies(robot: Robot, masses: Numbers) -> BodyParameters:
+    """Return inertial parameters of point masses half-way to the next joint.
+
+    Args:
+        robot: Robot.
+        masses: Masses of the bodies [kg].
+
+    Raises:
+        InputError: If there is not one mass for each body.
+    """
+    body_masses = as_finite_array("`masses`", np.asarray(masses), (robot.bodies,))
+    ends = np.zeros((robot.bodies, 3))
+    for body, parent in enumerate(robot.parent):
+        if parent >= 0:
+            ends[parent] = robot.offset[body]
+    ends[robot.tip_body] = robot.tip_offset
+    tensors = np.zeros((robot.bodies, 3, 3))
+    return np.asarray(Inertia(body_masses, 0.5 * ends, tensors).parameters)

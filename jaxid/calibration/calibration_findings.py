@@ -1,0 +1,153 @@
+"""Whether a calibrated geometry may be used: findings, the verdict first."""
+
+from collections.abc import Iterator
+from typing import TYPE_CHECKING, NamedTuple
+
+import numpy as np
+
+from jaxid.result_table import Remark, Status, significant, sort_remarks
+
+if TYPE_CHECKING:
+    from .geometry_fit import GeometryFit
+
+MAX_EXAMPLES = 5
+"""Number of poses or sessions that a sentence names."""
+
+
+class FindingLimits(NamedTuple):
+    """Numbers above which something needs a look."""
+
+    session_error: float = 2.5  # held out, relative to the median of all sessions
+    shift: float = 0.01  # of an origin [m]
+    turn: float = 0.05  # of an origin [rad]
+    improvement: float = 0.8  # held-out errors over nominal ones
+
+
+LIMITS = FindingLimits()
+
+
+def calibration_findings(fit: "GeometryFit") -> list[Remark]:
+    """Return the verdict and all findings, the most severe first."""
+    findings = [
+        *(Remark(note, Status.DOUBTFUL) for note in fit.notes),
+        *_on_search(fit),
+        *_on_wrong_poses(fit),
+        *_on_corrections(fit),
+        *_on_held_out_sessions(fit),
+    ]
+    sorted_findings = sort_remarks(findings)
+    return [_verdict(fit, sorted_findings), *sorted_findings]
+
+
+def _verdict(fit: "GeometryFit", findings: list[Remark]) -> Remark:
+    """Return the sentence that sums up the result."""
+    worst = findings[0].status if findings else Status.GOOD
+    if not fit.can_hold_out:
+        sentence = (
+            "The geometry was not checked on sessions that it has not seen, for which "
+            "at least three are needed"
+        )
+        return Remark(sentence, worst if worst is Status.BAD else Status.DOUBTFUL)
+    before = 1e3 * fit.mean_error(fit.held_out.nominal)
+    after = 1e3 * fit.mean_error(fit.held_out.calibrated)
+    numbers = f"from {significant(before)} to {significant(after)} mm"
+    if after > LIMITS.improvement * before:
+        text = (
+            "The calibrated geometry is hardly better than the nominal one: on "
+            f"sessions held out in turn, the mean error changes {numbers}; do not use "
+            "it, and check joint coordinates, units and the robot's file"
+        )
+        return Remark(text, Status.BAD)
+    text = f"On sessions held out in turn, the mean error falls {numbers}"
+    if worst in (Status.BAD, Status.DOUBTFUL):
+        text += "; look at what is marked before you use the geometry"
+    return Remark(text, worst)
+
+
+def _on_search(fit: "GeometryFit") -> Iterator[Remark]:
+    """Yield a finding if the search has not ended."""
+    if not fit.solution.adjustment.has_converged:
+        yield Remark(
+            "The search has not ended: check the joint coordinates and their units, "
+            "and the robot's file",
+            Status.BAD,
+        )
+
+
+def _on_wrong_poses(fit: "GeometryFit") -> Iterator[Remark]:
+    """Yield a finding on poses that were left out."""
+    poses = np.flatnonzero(fit.solution.is_wrong)
+    if not len(poses):
+        yield Remark("All poses belong to each other", Status.GOOD)
+        return
+    largest_first = poses[np.argsort(-fit.errors.lengths[poses])]
+    examples = [
+        f"{fit.problem.pose_names[pose]} ({significant(1e3 * length, 2)} mm)"
+        for pose, length in zip(
+            largest_first[:MAX_EXAMPLES],
+            fit.errors.lengths[largest_first],
+            strict=False,
+        )
+    ]
+    yield Remark(
+        f"{len(poses)} of {np.count_nonzero(fit.problem.is_pose)} poses do not belong "
+        f"to the others and were left out: {'; '.join(examples)}",
+        Status.DOUBTFUL,
+    )
+
+
+def _on_corrections(fit: "GeometryFit") -> Iterator[Remark]:
+    """Yield findings on corrections and compliances that no robot should have."""
+    sizes = np.abs(fit.origins)
+    is_large = (sizes[:, :3] > LIMITS.shift) | (sizes[:, 3:] > LIMITS.turn)
+    names = np.array(fit.problem.robot.body_names)[is_large.any(axis=1)]
+    if len(names):
+        yield Remark(
+            f"The corrections of {', '.join(names)} are larger than manufacturing "
+            "errors: is it the file of this robot, and are these its coordinates?",
+            Status.DOUBTFUL,
+        )
+    values = fit.combinations.of(fit.values)
+    upper_ends = values + fit.uncertainty.half_widths()
+    for leader, end in zip(fit.combinations.leaders, upper_ends, strict=True):
+        correction = fit.corrections[leader]
+        if correction.kind == "compliance" and end < 0.0:
+            yield Remark(
+                f"The {correction.words} is negative: check the direction of gravity "
+                "and the masses",
+                Status.DOUBTFUL,
+            )
+
+
+def _on_held_out_sessions(fit: "GeometryFit") -> Iterator[Remark]:
+    """Yield findings on sessions that disagree with the others."""
+    if not fit.can_hold_out:
+        return
+    errors = fit.held_out.calibrated.lengths
+    poses = fit.problem.poses_of_sessions
+    means = np.array([errors[x].mean() for x in poses])
+    limit = LIMITS.session_error * np.median(means)
+    for session in np.flatnonzero(means > limit):
+        name = fit.problem.sessions[session]
+        yield Remark(
+            f"Session `{name}` disagrees with the others: held out, its mean error is "
+            f"{significant(1e3 * means[session])} mm; was something loose?",
+            Status.DOUBTFUL,
+        )
+    distances = fit.held_out.distances
+    outside = [x for x in distances if not x.is_inside]
+    if outside:
+        examples = [
+            f"{x.session} {significant(1e3 * x.error, 2)} ± "
+            f"{significant(1e3 * x.half_width, 2)} mm"
+            for x in outside[:MAX_EXAMPLES]
+        ]
+        yield Remark(
+            f"In {len(outside)} of {len(distances)} sessions that were held out, the "
+            "known distance is outside the interval of its prediction: "
+            f"{', '.join(examples)}",
+            Status.DOUBTFUL,
+        )
+    elif distances:
+        text = "Known distances are inside the intervals of their predictions"
+        yield Remark(f"{text} in all sessions, each held out", Status.GOOD)

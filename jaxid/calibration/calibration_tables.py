@@ -1,0 +1,124 @@
+"""Tables of a kinematic calibration."""
+
+import math
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from jaxid.result_table import (
+    MISSING,
+    Column,
+    Status,
+    Table,
+    estimate_columns,
+    significant,
+)
+
+from .corrections import undetermined_sentences
+
+if TYPE_CHECKING:
+    from .geometry_fit import GeometryFit
+
+DISPLAY_UNITS = {
+    "m": (1e3, "mm"),
+    "rad": (1e3, "mrad"),
+    "rad/(N m)": (1e6, "µrad/(N m)"),
+    "m/N": (1e6, "µm/N"),
+}
+"""Factors and names of the units of corrections in tables."""
+
+
+def in_thousandths(value: float) -> str:
+    """Return a number with three decimals, and a dash for NaN."""
+    return MISSING if math.isnan(value) else f"{value:z.3f}"
+
+
+def session_table(fit: "GeometryFit") -> Table:
+    """Return mean errors of the poses of each session, before and after."""
+    problem = fit.problem
+    sessions = problem.sessions
+    poses = problem.poses_of_sessions
+    columns = [
+        Column("session", sessions),
+        Column("poses", [len(x) for x in poses]),
+        Column("left out", [int(fit.solution.is_wrong[x].sum()) for x in poses]),
+    ]
+    sizes = {"nominal": fit.nominal_errors, "calibrated": fit.errors}
+    if fit.can_hold_out:
+        calibrated, nominal = fit.held_out[:2]
+        sizes = {"nominal,\nheld out": nominal, "calibrated": fit.errors}
+        sizes["calibrated,\nheld out"] = calibrated
+    for words, errors in sizes.items():
+        means = [1e3 * errors.lengths[x].mean() for x in poses]
+        columns.append(Column(words, means, "mm"))
+        if np.isfinite(errors.angles).any():
+            angles = [np.rad2deg(np.nanmean(errors.angles[x])) for x in poses]
+            columns.append(Column(words, angles, "deg"))
+    return Table(
+        "mean errors of the poses of each session",
+        *columns,
+        remarks=[
+            "Held out: the calibration has not seen the session; all poses count, also "
+            "those that it leaves out as wrong."
+        ],
+    )
+
+
+def correction_table(fit: "GeometryFit") -> Table:
+    """Return shifts, turns and compliances of all joints."""
+    robot = fit.problem.robot
+    shifts, turns = np.split(1e3 * fit.origins, 2, axis=1)
+    columns = [Column("joint", robot.body_names)]
+    for kind, values, unit in (("shift", shifts, "mm"), ("turn", turns, "mrad")):
+        for axis, name in enumerate("xyz"):
+            header = f"{kind}\n{name}"
+            columns.append(Column(header, values[:, axis], unit, format=in_thousandths))
+    if fit.has_compliance:
+        compliances = 1e6 * np.resize(fit.compliances, robot.bodies)
+        compliances[robot.joints :] = np.nan
+        unit = "µrad/(N m)" if all(robot.turns) else "µrad/(N m), µm/N"
+        columns.append(Column("compliance", compliances, unit, format=in_thousandths))
+    return Table(
+        "corrections of the joints' origins, along the nominal axes of each body",
+        *columns,
+        remarks=[
+            "Of corrections that the poses cannot tell apart, these are the smallest: "
+            "use them together. A turn about the axis of a joint is its zero."
+        ],
+    )
+
+
+def combination_table(fit: "GeometryFit") -> Table:
+    """Return what the poses determine, with intervals, the session being the unit."""
+    combinations = fit.combinations
+    corrections = [fit.corrections[k] for k in combinations.leaders]
+    scales = [DISPLAY_UNITS[x.unit] for x in corrections]
+    factors = np.array([factor for factor, _ in scales])
+    values = combinations.of(fit.values)
+    half_widths = fit.uncertainty.half_widths()
+    is_determined = fit.is_determined
+    count = len(fit.corrections)
+    return Table(
+        "combinations of corrections",
+        Column("named after", [x.words for x in corrections]),
+        *estimate_columns(
+            factors * values,
+            factors * fit.uncertainty.standard_deviations,
+            factors * np.array([values - half_widths, values + half_widths]),
+            [unit for _, unit in scales],
+        ),
+        facts=[
+            ("sessions", f"{len(fit.problem.sessions)}, the units of the intervals"),
+            ("prior", fit.solution.prior.words),
+            (
+                "determined",
+                f"{len(corrections)} combinations of {count} corrections; behind them "
+                f"the singular values fall by {significant(combinations.gap, 2)}",
+            ),
+        ],
+        status=[Status.GOOD if x else Status.NEUTRAL for x in is_determined],
+        remarks=[
+            "✓ the poses tell more than the prior; · the prior decides.",
+            *undetermined_sentences(fit.corrections, combinations),
+        ],
+    )

@@ -1,0 +1,191 @@
+"""Names of the corrections, and which of them poses can tell apart.
+
+Some corrections move the tool alike in all poses: a joint's origin may lie anywhere on
+its axis, for instance. Their columns depend on others, and only combinations are
+determined, as with the base parameters of a dynamic model.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import Indices, Matrix, Vector
+from jaxid.dynamics.rank import (
+    gram_schmidt,
+    rank_by_singular_values,
+    regrouping,
+    scale_columns,
+)
+from jaxid.robot.robot import Robot
+
+from .problem import CalibrationProblem, Linearisation
+
+AXES = "xyz"
+MIN_SHARE = 1e-7
+"""Share of a column that those before it must leave unexplained."""
+MIN_FACTOR = 1e-3
+"""Smallest share of a column in another one that is worth a word."""
+
+
+class Correction(NamedTuple):
+    """One number of a correction."""
+
+    owner: str  # joint or tool
+    kind: str  # zero (a turn about the joint's axis), shift, turn or compliance
+    axis: str  # its direction in words; empty for a compliance or a zero
+    unit: str  # of its value
+
+    @property
+    def words(self) -> str:
+        """The correction in words."""
+        return f"{self.kind} of `{self.owner}`{self.axis and ' ' + self.axis}"
+
+
+class Combinations(NamedTuple):
+    """Combinations of corrections that the poses determine, and what they cannot tell.
+
+    Attributes:
+        leaders: Indices of the corrections after which the combinations are named.
+        followers: Indices of the corrections that are part of combinations only.
+        factors: Factor of each follower in each combination.
+        rank: Number of determined combinations by the singular values.
+        gap: Ratio of the singular values on both sides of the rank.
+    """
+
+    leaders: Indices
+    followers: Indices
+    factors: Matrix
+    rank: int
+    gap: float
+
+    def of(self, values: np.ndarray) -> np.ndarray:
+        """Return the values of the combinations.
+
+        Args:
+            values: Values of all corrections, in the last axis.
+        """
+        leaders = values[..., list(self.leaders)]
+        return leaders + values[..., list(self.followers)] @ self.factors.T
+
+    def covariance(self, covariance: Matrix) -> Matrix:
+        """Return the covariance of the combinations from that of all corrections."""
+        return self.of(self.of(covariance).T)
+
+
+def common_corrections(problem: CalibrationProblem) -> list[Correction]:
+    """Return the corrections that all sessions share, in the order of their columns."""
+    robot = problem.robot
+    turns = robot.turns[: robot.joints]
+    corrections = []
+    for name, axis in zip(robot.body_names, robot.axis, strict=True):
+        of_joint = _of_frame(name)
+        if np.abs(axis).max() == 1.0:
+            number = 3 + int(np.argmax(np.abs(axis)))
+            of_joint[number] = Correction(name, "zero", "", "rad")
+        corrections += of_joint
+    for name, does_turn in zip(robot.joint_names, turns, strict=True):
+        unit = "rad/(N m)" if does_turn else "m/N"
+        corrections.append(Correction(name, "compliance", "", unit))
+    for session, name in problem.frame_keys:
+        if not session:
+            corrections += _of_frame(name)
+    return corrections
+
+
+def _of_frame(name: str) -> list[Correction]:
+    """Return the corrections of a frame."""
+    shifts = [Correction(name, "shift", f"along {axis}", "m") for axis in AXES]
+    turns = [Correction(name, "turn", f"about {axis}", "rad") for axis in AXES]
+    return shifts + turns
+
+
+def determined_combinations(
+    problem: CalibrationProblem, linearisation: Linearisation, scales: Vector
+) -> Combinations:
+    """Return the combinations that the poses determine.
+
+    Args:
+        problem: The problem.
+        linearisation: Errors and derivatives at the estimates.
+        scales: Prior deviations, in which columns are compared; those without are left
+            out.
+    """
+    common = problem.common_columns
+    blocks = []
+    for rows, columns in zip(
+        problem.session_rows, problem.session_columns, strict=True
+    ):
+        jacobian = linearisation.jacobian[rows] * scales
+        blocks.append(_without_frames(jacobian[:, common], jacobian[:, columns]))
+    columns = np.concatenate(blocks)
+
+    order = _order(problem.robot, len(common))
+    order = order[scales[common][order] > 0.0]
+    ordered_columns = columns[:, order]
+    dependence = gram_schmidt(ordered_columns, MIN_SHARE)
+    regrouped = regrouping(
+        ordered_columns, dependence.independent, dependence.dependent
+    )
+    leaders = order[list(dependence.independent)]
+    followers = order[list(dependence.dependent)]
+    # The factors are those of columns in units of the prior.
+    units = scales[common]
+    factors = regrouped.kappa * units[leaders][:, None] / units[followers]
+    rank = rank_by_singular_values(ordered_columns)
+    values = np.linalg.svd(scale_columns(ordered_columns)[0], compute_uv=False)
+    values = np.append(values, 0.0)
+    gap = values[rank - 1] / max(values[rank], np.finfo(float).eps * values[0])
+    return Combinations(
+        tuple(leaders.tolist()), tuple(followers.tolist()), factors, rank, float(gap)
+    )
+
+
+def _without_frames(jacobian: Matrix, by_frames: Matrix) -> Matrix:
+    """Return what no motion of a session's own frames explains, in few rows."""
+    left, values, _ = np.linalg.svd(by_frames, full_matrices=False)
+    basis = left[:, values > 1e-9 * values.max(initial=0.0)]
+    remainder = jacobian - basis @ (basis.T @ jacobian)
+    return np.asarray(np.linalg.qr(remainder, mode="r"))
+
+
+def _order(robot: Robot, size: int) -> np.ndarray:
+    """Return the columns in the order in which they name combinations.
+
+    Tools come first, then compliances, the zeros of joints, shifts and turns across the
+    axes, and last the shifts along axes: of two that poses cannot tell apart, the
+    earlier one names the combination.
+    """
+    bodies = robot.bodies
+    main_axes = np.argmax(np.abs(robot.axis), axis=1)
+    ranks = np.full(size, 0)
+    ranks[: 6 * bodies] = 3
+    first_columns = 6 * np.arange(bodies)
+    ranks[first_columns + 3 + main_axes] = 2
+    ranks[first_columns + main_axes] = 4
+    ranks[6 * bodies : 6 * bodies + robot.joints] = 1
+    return np.argsort(ranks, kind="stable")
+
+
+def undetermined_sentences(
+    corrections: list[Correction], combinations: Combinations
+) -> list[str]:
+    """Return a sentence for each correction that the poses cannot tell from others."""
+    sentences = []
+    silent = []
+    for follower, factors in zip(
+        combinations.followers, combinations.factors.T, strict=True
+    ):
+        is_part = np.abs(factors) > MIN_FACTOR * np.abs(factors).max(initial=0.0)
+        partners = [
+            corrections[leader].words
+            for leader, part in zip(combinations.leaders, is_part, strict=True)
+            if part
+        ]
+        if partners:
+            others = ", ".join(partners)
+            sentences.append(f"{corrections[follower].words}: not told from {others}")
+        else:
+            silent.append(corrections[follower].words)
+    if silent:
+        sentences.insert(0, f"without effect on the errors: {', '.join(silent)}")
+    return sentences

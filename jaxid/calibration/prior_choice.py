@@ -1,0 +1,111 @@
+"""How far a robot may be from its nominal geometry, chosen by leaving sessions out."""
+
+import itertools
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.arrays import Vector
+
+from .adjustment import SessionEquations, Weights, common_step, session_equations
+from .error_derivatives import Unknowns
+from .problem import CalibrationProblem, Linearisation
+from .wrong_poses import pose_sizes
+
+SLIDE_FACTOR = 0.1
+"""Compliance of a joint that slides [m/N] by that of one that turns [rad/(N m)]."""
+
+
+class GeometryPrior(NamedTuple):
+    """Standard deviations of a robot from its nominal geometry."""
+
+    shift: float  # of the origins of joints [m]
+    turn: float  # of the origins of joints [rad]
+    compliance: float  # of the joints [rad/(N m)]
+
+    @property
+    def words(self) -> str:
+        """The prior in words."""
+        return (
+            f"origins within {1e3 * self.shift:g} mm and {1e3 * self.turn:g} mrad, "
+            f"compliances within {1e6 * self.compliance:g} µrad/(N m) (standard "
+            "deviations)"
+        )
+
+
+MIDDLE_PRIOR = GeometryPrior(1e-3, 3e-3, 1e-5)
+"""Prior with which wrong poses are found, and where the choice begins."""
+PRIORS = tuple(
+    itertools.starmap(
+        GeometryPrior,
+        itertools.product((3e-4, 1e-3, 3e-3), (1e-3, 3e-3, 1e-2), (1e-5, 1e-4)),
+    )
+)
+"""Priors that are tried."""
+
+
+def prior_scales(
+    problem: CalibrationProblem, prior: GeometryPrior, has_compliance: bool
+) -> Vector:
+    """Return the prior deviation of each unknown: 1 m and 1 rad for frames."""
+    robot = problem.robot
+    shift_and_turn = np.repeat([prior.shift, prior.turn], 3)
+    compliances = prior.compliance * np.where(robot.revolute, 1.0, SLIDE_FACTOR)
+    return Unknowns(
+        np.tile(shift_and_turn, (robot.bodies, 1)),
+        has_compliance * compliances,
+        problem.freedoms.astype(float),
+    ).vector
+
+
+def choose_prior(
+    problem: CalibrationProblem,
+    vector: Vector,
+    weights: Weights,
+    has_compliance: bool,
+) -> GeometryPrior:
+    """Return the prior with the smallest errors on sessions that are left out in turn.
+
+    At this point the problem is linear enough: each prior is one solution of the
+    equations at the unknowns.
+    """
+    scales = np.stack([prior_scales(problem, x, has_compliance) for x in PRIORS])
+    linearisation = problem.linearise(vector)
+    equations = session_equations(
+        problem, linearisation, vector, scales[0], weights.poses
+    )
+    sessions = np.flatnonzero(weights.sessions).tolist()
+    if len(sessions) < 2:
+        return MIDDLE_PRIOR
+    common = problem.common_columns
+    totals = np.zeros(len(PRIORS))
+    for session in sessions:
+        other_weights = weights.sessions.copy()
+        other_weights[session] = 0.0
+        steps = common_step(equations, vector[common], scales[:, common], other_weights)
+        totals += [
+            _mean_size(problem, linearisation, equations, session, step, weights.poses)
+            for step in steps
+        ]
+    return PRIORS[int(np.argmin(totals))]
+
+
+def _mean_size(
+    problem: CalibrationProblem,
+    linearisation: Linearisation,
+    equations: list[SessionEquations],
+    session: int,
+    step: Vector,
+    pose_weights: Vector,
+) -> float:
+    """Return the mean size of a session's errors after a step of the others."""
+    own = equations[session]
+    columns = problem.session_columns[session]
+    frame_step = own.frame_slopes @ step + own.frame_step
+    jacobian = linearisation.jacobian
+    changes = (
+        jacobian[:, problem.common_columns] @ step + jacobian[:, columns] @ frame_step
+    )
+    sizes = pose_sizes(problem, linearisation.errors + changes)
+    is_counted = problem.is_pose & (problem.pose_sessions == session)
+    return float(np.average(sizes[is_counted], weights=pose_weights[is_counted]))

@@ -1,0 +1,70 @@
+"""Poses that do not belong to the others: a ball beside its socket, a wrong corner."""
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+
+from jaxid.arrays import Vector
+
+from .adjustment import Weights, adjust
+from .problem import CalibrationProblem
+
+ROBUST_STEPS = 8
+"""Steps with weights that fall with the errors; the first ones have equal weights."""
+EQUAL_STEPS = 3
+
+
+class ErrorLimits(NamedTuple):
+    """Errors of poses, in units of the typical error.
+
+    Of normal errors of a point in space 0.3 % are beyond the largest.
+    """
+
+    half_weight: float = 3.0
+    wrong: float = 3.8
+    min_typical_size: float = 0.1  # in units of the stated deviation
+    max_share: float = 0.5  # of the poses of a session; with more it disagrees itself
+
+
+LIMITS = ErrorLimits()
+
+
+def pose_sizes(problem: CalibrationProblem, errors: Vector) -> Vector:
+    """Return the size of each pose's errors, of which the median is one for noise."""
+    squares = np.bincount(problem.rows.pose, errors**2)
+    counts = np.bincount(problem.rows.pose)
+    return np.sqrt(squares / scipy.special.chdtri(counts, 0.5))
+
+
+def find_wrong_poses(
+    problem: CalibrationProblem,
+    start: Vector,
+    scales: Vector,
+    session_weights: Vector,
+) -> tuple[np.ndarray, Vector]:
+    """Return whether each pose is wrong, and the unknowns without these poses.
+
+    Sessions without weight are not looked at: none of their poses is wrong.
+    """
+    is_used = session_weights[problem.pose_sessions] > 0.0
+    is_used &= problem.is_pose
+    weights = np.ones(len(is_used))
+    relative_sizes = np.zeros(len(is_used))
+    vector = start
+    for number in range(ROBUST_STEPS):
+        end = adjust(
+            problem, vector, scales, Weights(session_weights, weights), max_steps=1
+        )
+        vector = end.vector
+        if number < EQUAL_STEPS:
+            continue
+        sizes = pose_sizes(problem, end.linearisation.errors)
+        typical_size = max(np.median(sizes[is_used]), LIMITS.min_typical_size)
+        relative_sizes = np.where(is_used, sizes / typical_size, 0.0)
+        weights = 1.0 / (1.0 + (relative_sizes / LIMITS.half_weight) ** 2) ** 2
+    is_wrong = np.greater(relative_sizes, LIMITS.wrong)
+    for poses in problem.poses_of_sessions:
+        if is_wrong[poses].mean() > LIMITS.max_share:
+            is_wrong[poses] = False
+    return is_wrong, vector
