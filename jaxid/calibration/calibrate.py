@@ -45,8 +45,14 @@ def calibrate(
         compliance: Whether joints deflect under gravity.
 
     Raises:
-        InputError: If there is no observation, or coordinates do not fit the robot.
+        InputError: If there is no observation, coordinates do not fit the robot, or it
+            has closed loops.
     """
+    if robot.loops:
+        raise InputError(
+            f"`robot` must be an open chain or tree, but `{robot.name}` has closed "
+            "loops: calibrate one of its arms (`tip`)."
+        )
     if not observations:
         raise InputError("`observations` must hold at least one observation.")
     for observation in observations:

@@ -14,8 +14,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Array, Float
-from jaxid.robot.follower_joints import speed_ratios
 from jaxid.robot.forward_kinematics import placements
+from jaxid.robot.joint_coordinates import linear_ratios
 from jaxid.robot.robot import Robot
 
 from .frames import Frame, small_rotation
@@ -191,7 +191,7 @@ def _carrier_motion(
     turns_or_not = np.array(robot.turns)[:, None]
     by_joints = jnp.where(turns_or_not, _turn_motion(directions, levers), slides)
     by_joints = by_joints * is_in_chain[:, None]
-    ratios = speed_ratios(robot.followers, robot.joints)
+    ratios = linear_ratios(robot.followers, robot.joints)
     by_coordinates = ratios.T @ by_joints
     return CarrierMotion(
         carrier,

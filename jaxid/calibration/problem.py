@@ -15,8 +15,8 @@ import numpy as np
 
 from jaxid.arrays import Float, Vector, double_precision
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.sample_methods import in_numpy
 from jaxid.dynamics.terms import RigidBodies
+from jaxid.program.sample_methods import in_numpy
 from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.inertia import BodyParameters
 from jaxid.robot.robot import Robot
