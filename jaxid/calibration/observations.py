@@ -1,4 +1,4 @@
-"""Observations for kinematic calibration: what was measured in poses of a robot.
+"""Observations for kinematic calibration: measurements in poses of a robot.
 
 Each compares the `tool`, a point or frame on the end-effector, with a `place`, a point
 or frame in the room. Where both are is unknown.
@@ -34,7 +34,7 @@ POINT: Freedoms = SHIFT
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class AbstractObservation(abc.ABC):
-    """What was measured in some poses of one session.
+    """Measurements in some poses of one session.
 
     A session is what is set up once: its poses share the errors of the setup.
 
