@@ -71,6 +71,7 @@ METHODS = (
     Script("states", 5),
     Script("agreement", 10),
     Script("rollout", 55),
+    Script("calibration", 6),
     Script("transients", 1),
     Script("excitation", 60),
     Script("safe_motions", 40),

@@ -1,5 +1,6 @@
 """Kinematic calibration: the geometry of a robot from poses in several sessions."""
 
+from .adjustment import Weights as Weights, adjust as adjust
 from .calibrate import rough_bodies as rough_bodies
 from .error_derivatives import corrected_robot as corrected_robot
 from .geometry_fit import GeometryChange as GeometryChange, GeometryFit as GeometryFit
