@@ -204,10 +204,13 @@ def _compare_gain(fit: ServoFit, name: str, joint: int) -> Remark:
     result = "agrees" if agrees else "differs"
     status = Status.GOOD if agrees else Status.DOUBTFUL
     text = f"{text}, estimated {' ± '.join(texts)}: {result}"
-    if is_stiffness and ratio > high:
-        # A servo under less gravity sags as little as a stiffer one.
-        share = 100.0 * (1.0 - gain / estimate)
-        text = f"{text}, or the controller cancels {share:.0f} % of the gravity"
+    if is_stiffness and not agrees:
+        # Logs tell only the product of load and compliance.
+        excess = 100.0 * (gain / estimate - 1.0)
+        reason = f"the controller cancels {-excess:.0f} % of the gravity"
+        if excess > 0.0:
+            reason = f"the load is {excess:.0f} % larger than that of the given masses"
+        text = f"{text}, or {reason}"
     return Remark(text, status)
 
 

@@ -1,8 +1,9 @@
 """Which parameters of servos, or combinations of some, logs determine, and how well.
 
 An estimate can differ from the truth by the noise of its own motions (spectral
-sandwich), by effects that the model lacks and that differ between motions (their
-scatter), and by those that differ between equal joints (their scatter). Each counts.
+sandwich, or sums over stretches between reversals), by effects that the model lacks and
+that differ between motions (their scatter), and by those that differ between equal
+joints (their scatter). Each counts.
 """
 
 import dataclasses
@@ -12,6 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
+from jaxid.arrays import Vector
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
@@ -183,20 +185,52 @@ class _Joint(NamedTuple):
             counted,
             float(motion.sample_time.mean()),
         )
-        # The sandwich is blind where no error can show: there the information alone
-        # tells.
+        # Where a joint rests, the rounding of its encoder is the same again and again.
+        # No spectrum tells that, as it is the same for all samples.
+        stretch_squares = self._changes_by_stretches(symbols, B) ** 2
+        stretches = len(stretch_squares)
+        stretch_sums = stretch_squares.sum(axis=0)
+        stretch_variance = stretches / max(stretches - len(B), 1) * stretch_sums
+        fourth_powers = np.maximum((stretch_squares**2).sum(axis=0), 1e-300)
+        stretch_dof = np.maximum(3.0 * stretch_sums**2 / fourth_powers - 2.0, 1.0)
+        is_wider = stretch_variance > variances[0]
+        noise_dof = np.where(is_wider, stretch_dof, dofs[0])
+        # Sums are blind where no error can show: there the information alone tells.
         sample_count = max(self.errors.shape[-1] * float(counted.max()), 1.0)
-        variance = np.maximum(variances[0], squares / sample_count)
+        variance = np.maximum(variances[0], stretch_variance)
+        variance = np.maximum(variance, squares / sample_count)
 
         changes = fit.equations.gradient[:, j, symbols] @ B
         motion_dof = max(motions - 1, 1)
         scatter = motions / motion_dof * (changes**2).sum(axis=0)
-        limit = scipy.stats.f.ppf(0.95, motion_dof, dofs[0])
+        limit = scipy.stats.f.ppf(0.95, motion_dof, noise_dof)
         is_scattered = (motions > 1) & (scatter > limit * variance)
-        dof = np.where(is_scattered, motion_dof, dofs[0])
+        dof = np.where(is_scattered, motion_dof, noise_dof)
         deviation = np.sqrt(np.where(is_scattered, scatter, variance))
         factor = deviation / np.sqrt(np.maximum(squares, 1e-300))
         return Deviations(B * np.outer(factor, factor), dof, ~is_scattered)
+
+    def _changes_by_stretches(self, symbols: np.ndarray, B: np.ndarray) -> np.ndarray:
+        """Return changes of estimates by the errors of each stretch of the motions.
+
+        Stretches end in the middle between two reversals.
+
+        Args:
+            symbols: Indices of the parameters.
+            B: Inverse of their information.
+
+        Returns:
+            Changes [stretches, parameters].
+        """
+        fit = self.fit
+        positions = fit.simulator.motion.positions[:, self.number]
+        changes = []
+        for k, length in enumerate(fit.simulator.motion.lengths):
+            errors = self.errors[k]
+            starts = stretch_starts((positions[k] + errors)[:length])
+            scores = fit.weights[k, self.number] * self.columns[k, symbols] * errors
+            changes.append(np.add.reduceat(scores, starts, axis=1).T @ B)
+        return np.concatenate(changes)
 
     def combinations(
         self, symbols: np.ndarray, deviations: Deviations
@@ -240,6 +274,16 @@ class _Joint(NamedTuple):
             )
             combinations.append(combination)
         return combinations
+
+
+def stretch_starts(path: Vector) -> np.ndarray:
+    """Return the first samples of stretches that hold one reversal of a path each."""
+    steps = np.diff(path)
+    moves = np.flatnonzero(steps)
+    signs = np.sign(steps[moves])
+    reversals = moves[1:][signs[1:] != signs[:-1]]
+    middles = (reversals[1:] + reversals[:-1]) // 2
+    return np.unique([0, *middles])
 
 
 def _description(symbol: int, coefficients: np.ndarray) -> tuple[str, str]:

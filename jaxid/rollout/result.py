@@ -259,12 +259,18 @@ class ServoFit(Summarised):
         if self.contacts:
             text = f"{self.left_out} samples within them are left out of the fit"
             facts.append(("contacts given", text))
-        is_clear = [c.is_determined and c.agrees for c in rows]
         remarks: list[Remark | str] = [
             "Positions determine inertias, friction, load and motor gain only in their "
-            "ratios to the stiffness.",
-            *(Remark(note, Status.DOUBTFUL) for note in self.notes),
+            "ratios to the stiffness."
         ]
+        status = [_status(c) for c in rows]
+        if Status.NEUTRAL in status:
+            remarks.append(
+                "1 / stiffness is as good as the masses of the given bodies: logs "
+                "determine only the product of both, and intervals do not contain "
+                "errors of the masses."
+            )
+        remarks += [Remark(note, Status.DOUBTFUL) for note in self.notes]
         return Table(
             "joints behind position servos",
             Column("joint", [self.joint_names[j] for j in joints]),
@@ -278,7 +284,7 @@ class ServoFit(Summarised):
             ),
             facts=facts,
             remarks=remarks,
-            status=[Status.GOOD if x else Status.DOUBTFUL for x in is_clear],
+            status=status,
             rules=(np.flatnonzero(np.diff(joints)) + 1).tolist(),
         )
 
@@ -288,6 +294,14 @@ class ServoFit(Summarised):
         return ", ".join(
             f"{name} {significant(x)}" for name, x in pairs if np.isfinite(x)
         )
+
+
+def _status(combination: Combination) -> Status:
+    """Return the judgement of an estimate; none if it depends on given masses."""
+    if not (combination.is_determined and combination.agrees):
+        return Status.DOUBTFUL
+    depends_on_masses = combination.coefficients[INDEX["a"]] != 0.0
+    return Status.NEUTRAL if depends_on_masses else Status.GOOD
 
 
 def _notes_on_effects(

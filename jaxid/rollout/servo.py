@@ -28,6 +28,17 @@ SHARES = (1.0 - GAMMA, GAMMA)
 """Fraction of a step by which the position moves in each stage."""
 VELOCITY_FACTORS = ((1.0 - GAMMA) / GAMMA, 1.0)
 """Change of velocity behind each stage, over that in it."""
+JUMP_FACTORS = (
+    (0.5 / (GAMMA * (1.0 - GAMMA)), -1.0 / (1.0 - GAMMA)),
+    (-0.5 / GAMMA**2, 2.0 / GAMMA),
+)
+"""Share of the command behind a jump in each stage, from its share `s` of the step.
+
+The factors are those of `s²` and `s`. So the velocity and the position behind a step
+are those of a force that jumps within it.
+"""
+MEAN_FACTORS = ((0.0, 1.0), (0.0, 1.0))
+"""Those of commands whose mean over the step acts in both stages."""
 MAX_DELAY = 0.3
 """Largest delay of the commands [s]."""
 
@@ -92,6 +103,7 @@ class StageInputs(NamedTuple):
         inertia: Inertia of the bodies [kg m² or kg].
         share: Fraction of the step by which the position moves.
         ahead: Factor of the change of velocity with which the next stage starts.
+        jump_factors: Those of the stage, as in `JUMP_FACTORS`.
     """
 
     first_command: Any
@@ -102,6 +114,7 @@ class StageInputs(NamedTuple):
     inertia: Any
     share: AnyArray
     ahead: AnyArray
+    jump_factors: Any
 
 
 def is_held_until_jump(state: State, theta: Array, inputs: StageInputs) -> Array:
@@ -140,9 +153,12 @@ def advance_stage(
     load = a * inputs.load
     integral_factor = 1.0 + ki * duration
     feed_forward = f * g * inputs.command_rate
-    second_share = 1.0 - inputs.first_share
+    step_share = 1.0 - inputs.first_share
+    square_factor, factor = inputs.jump_factors
+    stage_share = (square_factor * step_share + factor) * step_share
     # While dry friction holds a joint, it balances all other forces.
-    first_share = jnp.where(is_held, 0.0, inputs.first_share)
+    first_share = jnp.where(is_held, 0.0, 1.0 - stage_share)
+    second_share = jnp.where(is_held, step_share, stage_share)
 
     def mean_of_parts(first: Array, second: Array) -> Array:
         return first_share * first + second_share * second
@@ -171,7 +187,7 @@ def advance_stage(
     next_velocity = jnp.where(is_moving, w + inputs.ahead * (u - w), 0.0)
     step = inputs.share * h
     jump = inputs.first_command - inputs.second_command
-    command = inputs.second_command + inputs.first_share * jump
+    command = inputs.second_command + (1.0 - second_share) * jump
     error = g * command + b - q
     next_integral = integral + step * ki * (error - duration * u)
     return State(q + step * u, next_velocity, next_integral)

@@ -22,6 +22,8 @@ from .motion import Place, ServoMotion
 from .servo import (
     GAMMA,
     INDEX,
+    JUMP_FACTORS,
+    MEAN_FACTORS,
     SHARES,
     VELOCITY_FACTORS,
     StageInputs,
@@ -215,16 +217,18 @@ def _path(
     def step(state: State, inputs: tuple[DelayedCommand, Array, Array]):
         commands, load, inertia = inputs
 
-        def stage_of(stage_inputs: tuple[DelayedCommand, Array, Array]) -> StageInputs:
-            command, share, ahead = stage_inputs
-            return StageInputs(*command.at(lateness, h), load, inertia, share, ahead)
+        def stage_of(stage_inputs: tuple[DelayedCommand, tuple]) -> StageInputs:
+            command, constants = stage_inputs
+            return StageInputs(*command.at(lateness, h), load, inertia, *constants)
 
-        def advance(state: State, stage_inputs: tuple[DelayedCommand, Array, Array]):
+        def advance(state: State, stage_inputs: tuple[DelayedCommand, tuple]):
             stage = stage_of(stage_inputs)
             return advance_stage(state, theta, stage, is_held, h), None
 
-        shares = jnp.array(SHARES), jnp.array(VELOCITY_FACTORS)
-        stages = commands, *shares
+        # If every step holds a jump, mean commands are closer to a smooth motion.
+        jump_factors = JUMP_FACTORS if steps > 1 else MEAN_FACTORS
+        constants = map(jnp.array, (SHARES, VELOCITY_FACTORS, jump_factors))
+        stages = commands, tuple(constants)
         first_stage = stage_of(jax.tree.map(lambda x: x[0], stages))
         is_held = is_held_until_jump(state, theta, first_stage)
         # A loop: XLA would fuse two stages into one long expression, twice as slow.

@@ -9,7 +9,10 @@ from simulated_joints import INDEX, parameter_rows
 
 import jaxid as jid
 from jaxid.rollout import ServoMotion, ServoSimulator
-from jaxid.rollout.determined_combinations import determined_combinations
+from jaxid.rollout.determined_combinations import (
+    determined_combinations,
+    stretch_starts,
+)
 from jaxid.rollout.effect_choice import undetermined_effects
 from jaxid.rollout.equal_joints import joint_groups, pull_equal_joints
 from jaxid.rollout.joint_fits import JointFit
@@ -104,6 +107,43 @@ def test_deviations_are_at_least_those_of_independent_errors(logs):
         independent = error**2 * np.linalg.inv(columns @ columns.T)
         place = slice(4 * j, 4 * j + 4)
         assert (np.diag(covariance)[place] > 0.99 * np.diag(independent)).all()
+
+
+def test_stretches_hold_one_reversal_each():
+    path = np.array([0.0, 1.0, 2.0, 2.0, 2.0, 1.0, 0.0, 0.0, 1.0, 2.0, 1.0, 0.0])
+    np.testing.assert_array_equal(stretch_starts(path), [0, 5, 8])
+    np.testing.assert_array_equal(stretch_starts(path[:6]), [0])
+    np.testing.assert_array_equal(stretch_starts(np.zeros(5)), [0])
+
+
+def test_errors_that_last_as_long_as_a_stretch_count_once(logs):
+    """Each stretch has one error of random sign: variances are sums of squares."""
+    fit = fit_of(logs, **TRUTH)
+    path = fit.simulator.positions(fit.parameters, fit.start)
+    stretches = np.zeros(path.shape, int)
+    for m, j in np.ndindex(path.shape[:2]):
+        stretches[m, j, stretch_starts(path[m, j])] = 1
+    stretches = np.cumsum(stretches, axis=-1)
+    signs = np.random.default_rng(0).choice([-1.0, 1.0], (*path.shape[:2], 999))
+    errors = 1e-3 * np.take_along_axis(signs, stretches, axis=-1)
+    motion = dataclasses.replace(fit.simulator.motion, positions=path + errors)
+    fit = JointFit.of(
+        ServoSimulator(motion), fit.parameters, fit.free, start=fit.start
+    ).weighed_by_errors()
+    _, S = fit.simulator.sensitivities(fit.parameters, fit.start)
+    by_start = np.einsum("mjst,mjsp->mjpt", S[..., -3:, :], fit.equations.response)
+    columns = (S[..., :-3, :] + by_start)[:, :, PLACES]
+    covariance = determined_combinations(fit, ((0,), (1,))).uncertainty.covariance
+    for j in range(2):
+        information = fit.equations.information[:, j].sum(axis=0)
+        inverse = np.linalg.inv(information[np.ix_(PLACES, PLACES)])
+        variances = 0.0
+        for m, k in np.ndindex(len(path), stretches[:, j].max() + 1):
+            is_within = stretches[m, j] == k
+            score = 1e-3 * fit.weights[m, j] * columns[m, j][:, is_within].sum(axis=-1)
+            variances = variances + (inverse @ score) ** 2
+        place = slice(4 * j, 4 * j + 4)
+        assert (np.diag(covariance)[place] > 0.999 * variances).all()
 
 
 def test_an_effect_that_never_acts_is_not_determined(logs):

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import servo_arm
 from scipy.signal import lsim
-from simulated_joints import INDEX, motion_of, parameter_rows, path_of
+from simulated_joints import INDEX, commands, motion_of, parameter_rows, path_of
 
 from jaxid.rollout import ServoMotion, ServoSimulator
 from jaxid.rollout.dry_friction import slip_of
@@ -38,6 +38,20 @@ def test_a_joint_within_its_friction_does_not_creep():
     assert np.ptp(at_rest) == 0.0
     # It stops where the friction and the bias hold it, short of the command.
     assert 0.0 < 0.5 - at_rest[0] < 0.02 + 0.01
+
+
+def test_held_commands_that_jump_within_a_step_act_at_their_instant():
+    """A joint with friction leads or lags by as little as 3 urad, for any delay."""
+    delays = np.array([0.0105, 0.0110, 0.0117, 0.0120])
+    sent = np.tile(commands(3, [0.6], 300), len(delays))
+    motion = motion_of(sent)
+    rows = parameter_rows(len(delays), J=4e-3, B=0.05, d=delays, F=0.02)
+    paths = [
+        ServoSimulator(motion, step, True).positions(rows, motion.start)[0]
+        for step in (0.0025, 0.0002)
+    ]
+    leads = (paths[0] - paths[1]) * np.sign(np.gradient(paths[1], axis=1))
+    assert np.abs(leads.mean(axis=1)).mean() < 3e-6
 
 
 def test_a_joint_that_turns_around_keeps_its_velocity():
