@@ -105,9 +105,19 @@ def servo_report(
     rows = []
     for c in fit.combinations:
         low, high = c.interval()
-        row = {**vars(c), "joint": fit.joint_names[c.joint]}
-        del row["coefficients"]
-        rows.append({**row, "low_95": low, "high_95": high})
+        row = {
+            "name": c.name,
+            "joint": fit.joint_names[c.joint],
+            "kind": c.meaning,
+            "unit": c.unit,
+            "estimate": c.value,
+            "standard_deviation": c.deviation,
+            "dof": c.dof,
+            "agrees": c.agrees,
+            "low_95": low,
+            "high_95": high,
+        }
+        rows.append(row)
     content: Record = {"kind": "commands", "windows": windows}
     content["simulators"] = simulator_values(fit) if fit.has_stiffness else None
     column = Column("simulation,\nwindows of 1 s", 1e3 * windows)
@@ -134,6 +144,9 @@ def torque_report(
         findings: Findings on the logs.
     """
     rows = estimate_rows(fit.names, fit.units, fit.unknowns, fit.uncertainty)
+    kinds = [*fit.rollout.base.kinds, "delay"]
+    for row, kind, dof in zip(rows, kinds, fit.uncertainty.dof, strict=True):
+        row.update(kind=kind, dof=float(dof))
     content = {"kind": "torques", "horizon": fit.horizon}
     return _report(robot, fit, errors, sources, findings, content, rows)
 

@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from jaxid.arrays import Vector
+from jaxid.identification.run_to_run import Run
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import (
@@ -123,6 +124,21 @@ class ServoFit(Summarised):
             if c.name == "a" and c.is_determined:
                 values[c.joint] = 1.0 / c.value
         return values
+
+    @property
+    def run(self) -> Run:
+        """Estimates under the names of the logs, as `jid.agreement` takes them."""
+        rows = self.combinations
+        deviations = np.array([c.deviation for c in rows])
+        return Run(
+            name=", ".join(dict.fromkeys(self.motions)),
+            names=tuple(f"{c.name} ({self.joint_names[c.joint]})" for c in rows),
+            units=tuple(c.unit for c in rows),
+            kinds=tuple(c.meaning for c in rows),
+            parameters=np.array([c.value for c in rows]),
+            covariance=np.diag(deviations**2),
+            dof=float(np.median([c.dof for c in rows])),
+        )
 
     @property
     def has_stiffness(self) -> bool:

@@ -84,13 +84,17 @@ def read_run(report: Path, name: str) -> Fit | Run:
 
 def _run_of_rows(name: str, rows: Sequence[Record]) -> Run:
     """Return the estimates of a result file, by their own deviations."""
-    deviations = np.array([row["deviation"] for row in rows], float)
+    deviations = np.array([row["standard_deviation"] for row in rows], float)
+    # Not all parameters belong to a joint.
+    joints = [f" ({row['joint']})" if "joint" in row else "" for row in rows]
     return Run(
         name=name,
-        names=tuple(f"{row['name']} ({row['joint']})" for row in rows),
+        names=tuple(
+            row["name"] + joint for row, joint in zip(rows, joints, strict=True)
+        ),
         units=tuple(row["unit"] for row in rows),
-        kinds=tuple(row["meaning"] for row in rows),
-        parameters=np.array([row["value"] for row in rows], float),
+        kinds=tuple(row["kind"] for row in rows),
+        parameters=np.array([row["estimate"] for row in rows], float),
         covariance=np.diag(deviations**2),
         dof=float(np.median([row["dof"] for row in rows])),
     )

@@ -12,6 +12,7 @@ import servo_arm
 from typer.testing import CliRunner
 
 from jaxid.cli.app import app
+from jaxid.workflow.report_agreement import agree_reports
 
 FILE = """
 [robot]
@@ -230,3 +231,20 @@ def test_dry_friction_with_torques_must_be_smooth(driven, monkeypatch):
     assert done.exit_code != 0
     assert "epsilon = 0.1" in str(done.exception)
     assert not (driven / "none").exists()
+
+
+def test_reports_of_two_rollouts_are_compared(tmp_path):
+    """Their estimates are independent: pooled ones are means, weighed by variances."""
+    row = {"name": "B", "joint": "lift", "unit": "s", "kind": "damping / stiffness"}
+    for name, estimate, deviation in (("first", 0.05, 0.001), ("second", 0.053, 0.002)):
+        errors = {"standard_deviation": deviation, "dof": 40.0}
+        delay = {"name": "delay", "unit": "s", "kind": "delay", "estimate": 0.01}
+        rows = [{**row, "estimate": estimate, **errors}, {**delay, **errors}]
+        (tmp_path / name).mkdir()
+        text = json.dumps({"parameters": rows})
+        (tmp_path / name / "rollout.json").write_text(text)
+    report = agree_reports([tmp_path / "first", tmp_path / "second"])
+    assert report.result.names == ("B (lift)", "delay")
+    assert report.result.kinds == ("damping / stiffness", "delay")
+    assert not report.result.odd
+    np.testing.assert_allclose(report.result.parameters, [0.0506, 0.01], rtol=0.02)
