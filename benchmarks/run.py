@@ -59,6 +59,7 @@ SPEED = (
     Script("fences", 2),
     Script("compile", 2),
     Script("streaming", 6),
+    Script("python_loop", 2),
     Script("batches", 2),
     Script("scaling", 8),
     Script("gpu", 2),
