@@ -63,7 +63,10 @@ def _assumed_limits(plan: ExcitationPlan) -> str:
         # Joints with the same value are named together.
         limit = f"{name} {value:.4g} {unit}"
         joints_by_limit.setdefault(limit, []).append(robot.joint_names[j])
-    texts = [f"{limit} of {listed(x)}" for limit, x in joints_by_limit.items()]
+    texts = []
+    for limit, joints in joints_by_limit.items():
+        are_all = len(joints) == robot.joints > 1
+        texts.append(f"{limit} of {'all joints' if are_all else listed(joints)}")
     return ", ".join(texts)
 
 

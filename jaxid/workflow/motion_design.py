@@ -110,10 +110,14 @@ class DesignedMotion(Summarised):
         return sort_remarks((*plan_remarks(self.plan), *self.remarks))
 
     def overview(self) -> list[Table]:
-        """Return the verdict, the findings, and the use of the joints' limits."""
+        """Return the verdict and the findings; for a good motion the use of limits."""
         checks = [x for x in self.findings if x.status is not Status.NEUTRAL]
+        lines = Table("", remarks=[self.verdict, *checks])
+        # First must be corrected what the lines name; the page has all tables.
+        if self.verdict.status is Status.BAD:
+            return [lines]
         _, _, limits, *_ = self.plan.tables()
-        return [Table("", remarks=[self.verdict, *checks]), limits]
+        return [lines, limits]
 
     def tables(self) -> list[Table]:
         """Return the tables of the plan, then all findings and the verdict."""
