@@ -344,7 +344,7 @@ def _in_parts(
         part = slice(start, start + size)
         inputs = [x[part] for x in rows]
         values = method.compiled(
-            *(jnp.asarray(x, dtype) for x in (*parameters, *inputs))
+            *(np.asarray(x, dtype) for x in (*parameters, *inputs))
         )
         # While this part is computed, the one before is copied.
         results[previous_part] = previous_values
