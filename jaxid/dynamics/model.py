@@ -21,12 +21,14 @@ from jaxid.arrays import (
     namespace,
 )
 from jaxid.errors import InputError
-from jaxid.program import Shape
-from jaxid.program.sample_methods import on_samples, spatial_form
+from jaxid.program import Program, Shape
+from jaxid.program.sample_methods import on_samples, program_of, spatial_form
+from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.joint_coordinates import at_sample
 from jaxid.robot.robot import Robot
 
 from . import projection_equation
+from .articulated_bodies import rigid_body_accelerations
 from .motion import Motion, as_motion, as_state
 from .packed_regressor import PackedRegressor, gram
 from .terms import (
@@ -44,6 +46,10 @@ Coordinates = ManyJoints | Sequence[Any]
 Parameters = Float[AnyArray, " standard"] | Sequence[float | int]
 
 DEFAULT_TERMS = (RigidBodies(), ViscousFriction(), CoulombFriction(), RotorInertia())
+
+
+MAX_JOINTS_OF_MATRIX = 12
+"""Joints up to which forward dynamics takes the mass matrix: its program is shorter."""
 
 
 def _has_memory(part: Any):
@@ -208,6 +214,29 @@ class Model(Hashable):
             self.inertia(p, q), forces - self.bias(p, q, qd)
         )
 
+    def drive_inertia(self, p, q) -> JointMatrix:
+        """Return the part of the mass matrix that is not that of the bodies."""
+        matrices = [
+            term.mass_matrix(self.robot, x, q)
+            for term, x in self.split(p)
+            if term.inertial_parameters(self.robot, x) is None
+        ]
+        n = self.robot.joints
+        return reduce(add, matrices, jnp.zeros((n, n), q.dtype))
+
+    def derived_program(self, name: str, *shapes: Shape) -> Program | None:
+        """Return the program of the method `acceleration` of many joints, else None."""
+        if name != "acceleration" or self.robot.joints <= MAX_JOINTS_OF_MATRIX:
+            return None
+        if self.robot.followers:
+            return None
+        p, q, *_ = shapes
+        nonzeros = np.asarray(program_of(self, self.drive_inertia, p, q).nonzeros)
+        if (nonzeros & ~np.eye(len(nonzeros), dtype=bool)).any():
+            return None
+        model = ArticulatedModel(self.robot, self.terms)
+        return program_of(model, model.acceleration, *shapes)
+
     def potential(self, p, q) -> AnyArray:
         """Return the potential energy of one sample by definition."""
         robot, q = at_sample(self.robot, q)
@@ -356,6 +385,29 @@ class Model(Hashable):
                 f"along its last axis, but has shape {q.shape}."
             )
         return q
+
+
+class ArticulatedModel(Model):
+    """A model by articulated bodies: the shortest program of many joints."""
+
+    def derived_program(self, name: str, *shapes: Shape) -> Program | None:
+        """Return None: its programs follow from no others."""
+        return None
+
+    def acceleration(self, p, q, qd, forces):
+        """Return the accelerations of one sample that forces cause (Eq. 38)."""
+        robot = self.robot
+        standstill = jnp.zeros_like(q)
+        bodies = jnp.zeros((robot.bodies, len(INERTIAL_NAMES)), q.dtype)
+        for term, x in self.split(p):
+            term_bodies = term.inertial_parameters(robot, x)
+            if term_bodies is None:
+                forces = forces - term.forces(robot, x, q, qd, standstill)
+            else:
+                bodies = bodies + term_bodies
+        diagonal = np.arange(robot.joints)
+        rotors = self.drive_inertia(p, q)[diagonal, diagonal]
+        return rigid_body_accelerations(robot, bodies, rotors, q, qd, forces)
 
 
 class SpatialModel(Model):

@@ -13,7 +13,7 @@ import threading
 from collections import OrderedDict
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -100,18 +100,25 @@ def opened(
 
 
 def with_open_numbers(model: eqx.Module, method: str) -> tuple[OpenModel, np.ndarray]:
-    """Return a method with all numbers of the model except 0, 1 and -1 as inputs."""
+    """Return a method with the numbers of the model as inputs.
+
+    What is 0, 1 or -1 for all bodies alike stays a constant: other zeros would make the
+    equations of the bodies differ.
+    """
     places = []
     numbers = [np.zeros(0)]
     for k, leaf in enumerate(jax.tree.leaves(model)):
         if not isinstance(leaf, np.ndarray) or leaf.dtype.kind != "f":
             continue
-        entries = leaf.ravel()
-        is_open = np.isfinite(entries) & ~np.isin(entries, (0.0, 1.0, -1.0))
+        rows = np.atleast_2d(leaf)
+        rows = rows.reshape(len(rows), -1)
+        is_alike = (rows == rows[0]).all(axis=0)
+        is_constant = is_alike & np.isin(rows[0], (0.0, 1.0, -1.0))
+        is_open = np.isfinite(rows) & ~is_constant
         positions = np.flatnonzero(is_open)
         if len(positions):
             places.append((k, tuple(positions.tolist())))
-            numbers.append(entries[positions])
+            numbers.append(leaf.ravel()[positions])
     return OpenModel(model, method, tuple(places)), np.concatenate(numbers)
 
 
@@ -126,12 +133,27 @@ asks for large pages. The compiled function serves every larger number of sample
 """
 CACHE_SIZE = 64
 """Number of programs that are kept, of the models that were used last."""
-MAX_JOINTS = {"inertia": 16, "acceleration": 16}
-"""Joints up to which a program that grows with their square is compiled."""
-MAX_OPERATIONS = 2000
-"""Operations up to which XLA compiles a program in one piece, some 4 ms for each."""
-MIN_REPETITION = 8
-"""Ratio of operations from which loops pay: each turn moves values to and fro."""
+
+
+class FormLimits(NamedTuple):
+    """Limits by which a method is compiled in one piece, in loops, or in spatial form.
+
+    XLA takes some 4 ms for each operation of a program.
+
+    Attributes:
+        piece: Operations up to which a program is compiled in one piece.
+        repetition: Ratio of operations from which loops over equal parts pay: each turn
+            moves values to and fro.
+        program: Operations above which loops are taken for any repetition, or the
+            spatial form if there are none.
+    """
+
+    piece: int = 4000
+    repetition: float = 8
+    program: int = 8000
+
+
+LIMITS = FormLimits()
 
 
 def spatial_form(owner: Any) -> Any:
@@ -169,7 +191,7 @@ class SampleMethod:
                 return program
         program = trace(self.definition, *self.shapes)
         is_method = getattr(self.definition, "__self__", None) is self.owner
-        if program.counts.total <= MAX_OPERATIONS or not is_method:
+        if program.counts.total <= LIMITS.piece or not is_method:
             return program
         return self._in_loops(program)
 
@@ -178,7 +200,8 @@ class SampleMethod:
         model, numbers = with_open_numbers(self.owner, self.definition.__name__)
         open_program = trace(model.call, numbers.shape, *self.shapes)
         loops = find_equal_parts(open_program, numbers)
-        if loops is None or loops.repetition < MIN_REPETITION:
+        is_short = program.counts.total <= LIMITS.program
+        if loops is None or (is_short and loops.repetition < LIMITS.repetition):
             return program
         return dataclasses.replace(program, loops=loops)
 
@@ -191,20 +214,16 @@ class SampleMethod:
 
     @property
     def is_long(self) -> bool:
-        """Whether the program would be long, and the spatial form is used."""
+        """Whether the program is too long for XLA, and the spatial form is used."""
         if self.spatial_definition is self.definition:
             return False
-        joints = self.shapes[-1][0]
-        name = getattr(self.owner, "method", self.definition.__name__)
-        return joints > MAX_JOINTS.get(name, math.inf)
+        is_in_loops = self.program.loops is not None
+        return self.program.counts.total > LIMITS.program and not is_in_loops
 
-    @functools.cached_property
+    @property
     def output_shape(self) -> Shape:
         """Shape of the result for one sample."""
-        if not self.is_long:
-            return self.program.output_shapes[0]
-        sample = [jnp.zeros(shape) for shape in self.shapes]
-        return jax.eval_shape(lambda *x: self.spatial_definition(*x), *sample).shape
+        return self.program.output_shapes[0]
 
     @functools.cached_property
     def over_rows(self) -> Callable:

@@ -88,10 +88,8 @@ def _pack_block(program: Program, values: Array, *arrays: Array) -> tuple[Rows, 
     if program.loops is None:
         return _pack(block_results, program, *arrays), values
     values = entry_rows(program, values, *arrays)
-    # Transposed first: entries of a sample are near each other then.
-    columns = values.T
-    results = program.loops.results
-    return columns.at[:, results].get(mode="promise_in_bounds"), values
+    entries = np.arange(len(program.outputs))
+    return rows_of(program, values, entries).T, values
 
 
 def _pack(results: Callable[..., Results], program: Program, *arrays: Array):

@@ -1,5 +1,7 @@
 """The public dynamics of many samples: by blocks, transformed, on all platforms."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -222,8 +224,8 @@ def test_eager_results_have_the_precision_of_compiled_ones(dtype):
 
 
 def test_a_long_chain_runs_in_loops_over_equal_parts(monkeypatch):
-    monkeypatch.setattr(sample_methods, "MAX_OPERATIONS", 100)
-    monkeypatch.setattr(sample_methods, "MIN_REPETITION", 1)
+    in_loops = sample_methods.FormLimits(piece=100, repetition=1)
+    monkeypatch.setattr(sample_methods, "LIMITS", in_loops)
     tree = random_tree(5, 6)
     model = jid.Model(tree.robot(), (jid.RigidBodies(), jid.ViscousFriction()))
     p = np.random.default_rng(1).normal(size=model.size)
@@ -241,3 +243,43 @@ def test_a_long_chain_runs_in_loops_over_equal_parts(monkeypatch):
     packed = jax.jit(lambda x: model.packed_regressor(x).values)(in_jax(x))
     eager = model.packed_regressor(x).values
     np.testing.assert_allclose(np.stack(packed), np.stack(eager), atol=1e-11)
+
+
+@pytest.mark.parametrize("virtual", [(), tuple(range(6))])
+def test_articulated_bodies_cause_the_accelerations_of_the_mass_matrix(virtual):
+    """Many joints, slides and branches, with rotors and friction."""
+    tree = random_tree(7, 14)
+    fields = {"revolute": (False,) * 3 + (True,) * 3 + tree.revolute[6:]}
+    if virtual:
+        fields |= {"parent": (*range(-1, 5), *(max(x, 5) for x in tree.parent[6:]))}
+    tree = dataclasses.replace(tree, **fields)
+    robot = tree.robot(virtual=virtual, floating=bool(virtual))
+    model = jid.Model(robot)
+    assert model.derived_program("acceleration", (model.size,), *[(14,)] * 3)
+    p = np.zeros(model.size)
+    bodies = len(robot.solid_bodies)
+    p[: 10 * bodies] = np.tile([2.0, 0.1, 0.2, -0.1, 0.5, 0.6, 0.7, 0, 0, 0], bodies)
+    p[10 * bodies :] = 0.3
+    q, qd, forces = np.random.default_rng(2).normal(size=(3, 300, 14))
+    q[:, list(virtual)] = 0.0
+    bias = model.bias_forces(p, q, qd)
+    expected = np.linalg.solve(model.mass_matrix(p, q), (forces - bias)[..., None])
+    found = model.forward_dynamics(p, q, qd, forces)
+    np.testing.assert_allclose(found, expected[..., 0], rtol=1e-9, atol=1e-9)
+    inputs = jnp.asarray(q), jnp.asarray(qd), jnp.asarray(forces)
+    compiled = jax.jit(lambda *x: model.forward_dynamics(p, *x))(*inputs)
+    np.testing.assert_allclose(compiled, found, rtol=1e-9, atol=1e-9)
+
+
+def test_coupled_drives_and_traced_geometry_keep_the_mass_matrix():
+    robot = random_tree(7, 14).robot()
+    reduction = np.eye(14)
+    reduction[3, 2] = 0.5
+    coupled = robot.replace(
+        drives=dataclasses.replace(robot.drives, reduction=reduction)
+    )
+    terms = (jid.RigidBodies(), jid.terms.CoupledDrives())
+    model = jid.Model(coupled, terms)
+    shapes = (model.size,), (14,), (14,), (14,)
+    assert model.derived_program("acceleration", *shapes) is None
+    assert jid.Model(random_tree(7, 12).robot()).derived_program("acceleration") is None

@@ -68,8 +68,8 @@ class RigidBodies(AbstractTerm):
             theta = theta[:, np.array(robot.solid_bodies)]
         return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
 
-    def all_ten(self, robot: Robot, p: TermParameters) -> Bodies:
-        """Return all ten parameters of the bodies, with zeros where left out."""
+    def inertial_parameters(self, robot: Robot, p: TermParameters) -> Bodies:
+        """Return ten parameters of each body, with zeros where they are left out."""
         solid_bodies = robot.solid_bodies
         bodies = p.reshape(len(solid_bodies), self.body_parameters)
         if self.principal_axes:
@@ -87,13 +87,13 @@ class RigidBodies(AbstractTerm):
     def forces(self, robot, p, q, qd, qdd):
         """Return the projected wrenches of all bodies (Eq. 11)."""
         return projection_equation.rigid_body_forces(
-            robot, self.all_ten(robot, p), q, qd, qdd
+            robot, self.inertial_parameters(robot, p), q, qd, qdd
         )
 
     def mass_matrix(self, robot, p, q):
         """Return the mass matrix of the bodies (Eq. 38)."""
         return projection_equation.rigid_body_mass_matrix(
-            robot, self.all_ten(robot, p), q
+            robot, self.inertial_parameters(robot, p), q
         )
 
     @property
@@ -119,9 +119,11 @@ class SpatialBodies(RigidBodies):
     def forces(self, robot, p, q, qd, qdd):
         """Return the generalised forces of all bodies (Eq. 11)."""
         return spatial_dynamics.spatial_forces(
-            robot, self.all_ten(robot, p), q, qd, qdd
+            robot, self.inertial_parameters(robot, p), q, qd, qdd
         )
 
     def mass_matrix(self, robot, p, q):
         """Return the mass matrix of the bodies (Eq. 38)."""
-        return spatial_dynamics.spatial_mass_matrix(robot, self.all_ten(robot, p), q)
+        return spatial_dynamics.spatial_mass_matrix(
+            robot, self.inertial_parameters(robot, p), q
+        )

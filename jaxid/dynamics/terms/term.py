@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, JointMatrix, Joints
+from jaxid.arrays import AnyArray, Bodies, Float, JointMatrix, Joints
 from jaxid.robot.robot import Robot
 
 TermParameters = Float[AnyArray, " columns"]
@@ -137,6 +137,10 @@ class AbstractTerm(eqx.Module):
         return jax.jacfwd(lambda qdd: self.forces(robot, p, q, standstill, qdd))(
             standstill
         )
+
+    def inertial_parameters(self, robot: Robot, p: TermParameters) -> Bodies | None:
+        """Return ten parameters of each body; None if the term is another effect."""
+        return None
 
     def potential_columns(self, robot: Robot, q: Joints) -> TermParameters:
         """Return the potential energy [J] of unit parameters."""
