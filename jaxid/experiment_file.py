@@ -188,6 +188,28 @@ KEYS: dict[str, TomlTable] = {
         "samples": Annotated[int, Bounds(minimum=0, maximum=10_000)],
         "horizon": Positive,
     },
+    "calibration": {
+        "observation": Literal[
+            "point_contact",
+            "plane_contact",
+            "known_distance",
+            "measured_position",
+            "measured_pose",
+        ],
+        "joints": Column,
+        "position": Column,
+        "attitude": Column,
+        "angle_unit": ANGLE_UNIT,
+        "length_unit": Literal["m", "mm"],
+        "eye_in_hand": bool,
+        "distance": Positive,
+        "place_stays": bool,
+        "parts": Annotated[int, Bounds(minimum=1, maximum=100)],
+        "deviation": Positive,
+        "angle_deviation": Positive,
+        "compliance": bool,
+        "masses": list[Magnitude],
+    },
     "excitation": {
         "criterion": Literal[
             "condition_number",

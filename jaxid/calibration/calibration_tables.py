@@ -14,7 +14,7 @@ from jaxid.result_table import (
     significant,
 )
 
-from .corrections import undetermined_sentences
+from .corrections import undetermined_corrections
 
 if TYPE_CHECKING:
     from .geometry_fit import GeometryFit
@@ -117,8 +117,15 @@ def combination_table(fit: "GeometryFit") -> Table:
             ),
         ],
         status=[Status.GOOD if x else Status.NEUTRAL for x in is_determined],
-        remarks=[
-            "✓ the poses tell more than the prior; · the prior decides.",
-            *undetermined_sentences(fit.corrections, combinations),
-        ],
+        remarks=["✓ the poses tell more than the prior; · the prior decides."],
+    )
+
+
+def undetermined_table(fit: "GeometryFit") -> Table:
+    """Return the corrections that the poses cannot tell from others."""
+    rows = undetermined_corrections(fit.corrections, fit.combinations)
+    return Table(
+        "corrections that the poses cannot tell from others",
+        Column("correction", [words for words, _ in rows]),
+        Column("not told from", [x or "nothing: it has no effect" for _, x in rows]),
     )

@@ -36,6 +36,13 @@ class Correction(NamedTuple):
     unit: str  # of its value
 
     @property
+    def group(self) -> str:
+        """Kind of the parameter, for comparisons of several calibrations."""
+        return {"zero": "joint zero", "compliance": "compliance"}.get(
+            self.kind, "joint origin"
+        )
+
+    @property
     def words(self) -> str:
         """The correction in words."""
         return f"{self.kind} of `{self.owner}`{self.axis and ' ' + self.axis}"
@@ -166,26 +173,19 @@ def _order(robot: Robot, size: int) -> np.ndarray:
     return np.argsort(ranks, kind="stable")
 
 
-def undetermined_sentences(
+def undetermined_corrections(
     corrections: list[Correction], combinations: Combinations
-) -> list[str]:
-    """Return a sentence for each correction that the poses cannot tell from others."""
-    sentences = []
-    silent = []
+) -> list[tuple[str, str]]:
+    """Return corrections that poses cannot tell, and those they cannot tell them from.
+
+    The second text is empty for corrections without effect on the errors.
+    """
+    rows = []
     for follower, factors in zip(
         combinations.followers, combinations.factors.T, strict=True
     ):
         is_part = np.abs(factors) > MIN_FACTOR * np.abs(factors).max(initial=0.0)
-        partners = [
-            corrections[leader].words
-            for leader, part in zip(combinations.leaders, is_part, strict=True)
-            if part
-        ]
-        if partners:
-            others = ", ".join(partners)
-            sentences.append(f"{corrections[follower].words}: not told from {others}")
-        else:
-            silent.append(corrections[follower].words)
-    if silent:
-        sentences.insert(0, f"without effect on the errors: {', '.join(silent)}")
-    return sentences
+        leaders = np.array(combinations.leaders)[is_part]
+        partners = ", ".join(corrections[leader].words for leader in leaders)
+        rows.append((corrections[follower].words, partners))
+    return sorted(rows, key=lambda row: bool(row[1]))

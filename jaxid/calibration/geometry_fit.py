@@ -9,13 +9,19 @@ import scipy
 
 from jaxid.arrays import AnyArray, Texts, Vector, double_precision
 from jaxid.errors import InputError
+from jaxid.identification.run_to_run import Run
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.result_table import Remark, Summarised, Table
 from jaxid.robot.robot import Robot
 
 from .adjustment import common_step
 from .calibration_findings import calibration_findings
-from .calibration_tables import combination_table, correction_table, session_table
+from .calibration_tables import (
+    combination_table,
+    correction_table,
+    session_table,
+    undetermined_table,
+)
 from .corrections import (
     Combinations,
     Correction,
@@ -214,6 +220,32 @@ class GeometryFit(Summarised):
             )
         return held_out_errors(self.problem, self.has_compliance)
 
+    @property
+    def shown_errors(self) -> HeldOutErrors:
+        """Errors of sessions that are held out if there are enough, or of the fit."""
+        if self.can_hold_out:
+            return self.held_out
+        return HeldOutErrors(self.errors, self.nominal_errors, ())
+
+    @property
+    def manner(self) -> str:
+        """How these errors were measured, in words."""
+        return "sessions held out in turn" if self.can_hold_out else "poses of the fit"
+
+    @property
+    def run(self) -> Run:
+        """What all sessions share, for comparisons of several calibrations."""
+        corrections = [self.corrections[k] for k in self.combinations.leaders]
+        return Run(
+            self.problem.robot.name,
+            tuple(correction.words for correction in corrections),
+            tuple(correction.unit for correction in corrections),
+            tuple(correction.group for correction in corrections),
+            self.combinations.of(self.values),
+            self.uncertainty.covariance,
+            float(self.dof),
+        )
+
     def compare(self, other: "GeometryFit") -> GeometryChange:
         """Compare with another calibration of the same arm, or of one of its kind.
 
@@ -279,8 +311,13 @@ class GeometryFit(Summarised):
         return combination_table(self)
 
     def tables(self) -> list[Table]:
-        """Return errors of the sessions, the largest corrections, and combinations."""
-        return [session_table(self), correction_table(self), self.summary()]
+        """Return errors of the sessions, corrections, and what the poses determine."""
+        return [
+            session_table(self),
+            correction_table(self),
+            self.summary(),
+            undetermined_table(self),
+        ]
 
     def overview(self) -> list[Table]:
         """Return the verdict, the findings, and errors of the sessions."""

@@ -316,5 +316,6 @@ for command in (
     payload_gains_states_rollout.gains,
     payload_gains_states_rollout.states,
     payload_gains_states_rollout.rollout,
+    payload_gains_states_rollout.calibrate,
 ):
     app.command(cls=Command, epilog=EXIT_CODES)(command)

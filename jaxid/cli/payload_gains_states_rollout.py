@@ -1,4 +1,4 @@
-"""Commands for several runs: `payload`, `gains`, `states`, `rollout`."""
+"""Commands for several runs: `payload`, `gains`, `states`, `rollout`, `calibrate`."""
 
 import dataclasses
 from pathlib import Path
@@ -145,5 +145,35 @@ def rollout(
     with terminal.progress_bar() as progress:
         report = jid.workflow.identify_rollout_from_logs(
             content.setup, logs, columns, content.rollout, unseen_logs, progress
+        )
+    show_runs(console, detail, report, output, content.text)
+
+
+def calibrate(
+    experiment: options.ExperimentFile,
+    sessions: Annotated[
+        list[Path],
+        typer.Argument(
+            help="A folder with a folder for each session, or files of poses.",
+            metavar="SESSIONS",
+        ),
+    ],
+    output: options.OutputFolder = Path("calibrated"),
+    force: options.Force = False,
+    detail: options.Detail = None,
+) -> None:
+    """Find the true geometry: joint origins, zeros, compliances.
+
+    From poses in which something was touched or measured, in several sessions. The
+    table `[calibration]` of the experiment file says what. Writes the robot's file with
+    calibrated origins, and a page with the errors of every pose before and after.
+    """
+    console = options.start(
+        *sessions, experiment=experiment, output=output, force=force
+    )
+    content = jid.experiment.load_experiment(experiment)
+    with terminal.progress_bar(counts_all=True) as progress:
+        report = jid.workflow.calibrate_from_files(
+            content.setup, sessions, content.calibration, progress
         )
     show_runs(console, detail, report, output, content.text)

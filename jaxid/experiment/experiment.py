@@ -19,6 +19,7 @@ from jaxid.measurement.filters import FILTERS
 from jaxid.measurement.log_files import summarise_columns
 from jaxid.robot.inertia import Tool
 from jaxid.workflow.excitation_settings import Excitation
+from jaxid.workflow.geometry_calibration import CalibrationSettings
 from jaxid.workflow.log_loading import is_report
 from jaxid.workflow.log_rollout import ServoSettings, TorqueSettings
 from jaxid.workflow.setup import LogReading, Setup
@@ -53,6 +54,7 @@ TABLES: dict[str, tuple[Callable, ...]] = {
     "rows": (build_rows,),
     "estimator": (build_estimation, BodyBounds),
     "rollout": (ServoSettings, TorqueSettings),
+    "calibration": (CalibrationSettings,),
     "excitation": (Excitation,),
     "collision": (Collision,),
 }
@@ -72,6 +74,7 @@ class Experiment:
     load: Tool | float | None
     # settings of simulations that follow commands, or torques
     rollout: ServoSettings | TorqueSettings
+    calibration: CalibrationSettings  # files of poses, and what was measured in them
     excitation: Excitation  # settings of the motion to design
     collision: Collision  # shapes that must keep a distance, as the file describes them
 
@@ -148,6 +151,7 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
         columns,
         load,
         _build_rollout(tables.get("rollout", {}), reading),
+        call(CalibrationSettings, tables.get("calibration", {}), "calibration"),
         _build_excitation(tables.get("excitation", {}), path.parent),
         _build_collision(tables.get("collision", {}), path.parent),
     )

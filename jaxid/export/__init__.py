@@ -1,6 +1,7 @@
 """Export of an identified model: C for controllers, files for simulators."""
 
 from .c_code import export_c as export_c
+from .calibrated_origins import export_origins as export_origins
 from .feed_forward import torque_program as torque_program
 from .identified_urdf import export_urdf as export_urdf
 from .jax_function import (

@@ -150,7 +150,7 @@ def _fix_joint(tree: UrdfTree, joint: Any) -> None:
     joint.set("type", "fixed")
     for mimic in joint.findall("mimic"):
         joint.remove(mimic)
-    origin = _child(joint, "origin")
+    origin = child_element(joint, "origin")
     origin.set("xyz", exact_text(position))
     origin.set("rpy", exact_text(rpy_angles(rotation)))
     origin.attrib.pop("quat_xyzw", None)  # another form of the same
@@ -164,11 +164,11 @@ def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None
     friction = np.append(dynamics.values["friction"], zeros)
     efforts = np.append(robot.known_max_forces, zeros + np.inf)
     for i, joint in enumerate(tree.joints):
-        element = _child(joint, "dynamics")
+        element = child_element(joint, "dynamics")
         element.set("damping", exact_text(damping[i]))
         element.set("friction", exact_text(friction[i]))
         if np.isfinite(efforts[i]):
-            limit = _child(joint, "limit")
+            limit = child_element(joint, "limit")
             limit.set("effort", exact_text(efforts[i]))
     # A URDF must have both; MJCF has no speeds.
     for limit in tree.root.iterfind("joint/limit"):
@@ -222,7 +222,7 @@ def _inertial(p: Vector) -> Any:
     )
 
 
-def _child(element: Any, tag: str) -> Any:
+def child_element(element: Any, tag: str) -> Any:
     """Return the child of a tag, which is added if it is missing."""
     child = element.find(tag)
     return etree.SubElement(element, tag) if child is None else child

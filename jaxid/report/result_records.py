@@ -29,6 +29,7 @@ KINDS = (
     "demo",
     "rollout",
     "agreement",
+    "calibration",
 )
 SCHEMAS = {f"{kind}.json": f"jaxid-{kind}/1" for kind in KINDS}
 """Files that hold results, and the schemas in them."""

@@ -1,6 +1,10 @@
 """The work of the commands as functions: from logs to a report, with one setup."""
 
 from .excitation_settings import Excitation as Excitation, Leads as Leads
+from .geometry_calibration import (
+    CalibrationSettings as CalibrationSettings,
+    calibrate_from_files as calibrate_from_files,
+)
 from .log_identification import (
     IdentificationReport as IdentificationReport,
     identify_logs as identify_logs,
