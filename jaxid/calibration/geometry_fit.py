@@ -234,7 +234,7 @@ class GeometryFit(Summarised):
 
     @property
     def run(self) -> Run:
-        """What all sessions share, for comparisons of several calibrations."""
+        """Estimates that all sessions share, for comparisons of calibrations."""
         corrections = [self.corrections[k] for k in self.combinations.leaders]
         return Run(
             self.problem.robot.name,
