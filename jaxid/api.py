@@ -55,6 +55,9 @@ from .identification.encoder_resolution import resolution_bias as resolution_bia
 from .identification.estimators import WeightedLeastSquares as WeightedLeastSquares
 from .identification.filter_selection import choose_filter as choose_filter
 from .identification.fit_result import Fit as Fit
+from .identification.force_sensor import (
+    identify_sensor_rotation as identify_sensor_rotation,
+)
 from .identification.friction_laws import (
     identify_nonlinear_friction as identify_nonlinear_friction,
     identify_presliding as identify_presliding,

@@ -89,6 +89,12 @@ KEYS: dict[str, TomlTable] = {
         "tool": LOAD,
     },
     "load": LOAD,
+    "sensor": {
+        "wrench": Column,
+        "sign": float,
+        "rotation": Vector,
+        "position": Vector,
+    },
     "limits": {
         "angle_unit": ANGLE_UNIT,
         "position_min": PerJoint,

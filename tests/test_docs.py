@@ -210,6 +210,13 @@ def given(tmp_path_factory):
     }
     names |= {"centre_of_mass": bodies[0][1:4] / bodies[0][0]}
     names |= {"matlab_inertia": _ordered(bodies[0], "Ixx Iyy Izz Iyz Ixz Ixy")}
+    # The wrench of a sensor is linear in what is behind it, as torques are.
+    arm = robot.with_sensor()
+    still = np.zeros((SAMPLES, 6))
+    motion = [np.hstack([x, still]) for x in (log.angles, 0 * log.angles)]
+    load = jid.Model(arm, (jid.terms.SensorLoad(),))
+    wrench = load.inverse_dynamics(bodies[1], *motion, motion[1])[:, 2:]
+    names |= {"wrench": wrench + np.random.default_rng(9).normal(size=wrench.shape)}
     names |= {"deviations": np.array([0.0, 1e-3])[:, None, None] * np.ones((2, 3))}
     return folder, {**names, "fit": jid.identify(base, observations)}
 

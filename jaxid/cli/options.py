@@ -74,6 +74,13 @@ Logs = Annotated[
         metavar="LOG",
     ),
 ]
+OptionalLogs = Annotated[
+    Paths | None,
+    typer.Argument(
+        help="Logs without the load, or the folder of an earlier report.",
+        metavar="LOG",
+    ),
+]
 Verified = Annotated[
     Paths | None,
     typer.Option(

@@ -20,8 +20,8 @@ TITLE_OF_LINES = "to use this result for other logs, add to the experiment file:
 
 def payload(
     experiment: options.ExperimentFile,
-    logs: options.Logs,
     loaded: options.Loaded,
+    logs: options.OptionalLogs = None,
     body: Annotated[
         str | None,
         typer.Option(metavar="JOINT", help="The joint that moves the payload."),
@@ -36,8 +36,10 @@ def payload(
 ) -> None:
     """Find a payload's mass, centre of mass and moments of inertia.
 
-    From logs without it and logs with it. Friction may differ between them.
+    From logs without it and logs with it. Friction may differ between them. With the
+    table `[sensor]` of a force sensor, logs without the payload may be left out.
     """
+    logs = logs or []
     console = options.start(
         *logs, *loaded, experiment=experiment, output=output, force=force
     )
@@ -49,7 +51,14 @@ def payload(
     columns = content.require_columns([*logs, *loaded])
     with terminal.progress_bar() as progress:
         report = jid.workflow.identify_payload_from_logs(
-            content.setup, logs, loaded, columns, carrier, mass, progress
+            content.setup,
+            logs,
+            loaded,
+            columns,
+            carrier,
+            mass,
+            progress,
+            content.sensor,
         )
     show_runs(console, detail, report, output, content.text)
 

@@ -19,6 +19,7 @@ from jaxid.measurement.filters import FILTERS
 from jaxid.measurement.log_files import summarise_columns
 from jaxid.robot.inertia import Tool
 from jaxid.workflow.excitation_settings import Excitation
+from jaxid.workflow.force_sensor_payload import ForceSensor
 from jaxid.workflow.geometry_calibration import CalibrationSettings
 from jaxid.workflow.log_loading import is_report
 from jaxid.workflow.log_rollout import ServoSettings, TorqueSettings
@@ -46,6 +47,7 @@ from .setup_tables import (
 TABLES: dict[str, tuple[Callable, ...]] = {
     "robot": (RobotSource,),
     "load": (known_load,),
+    "sensor": (ForceSensor,),
     "limits": (replace_limits,),
     "drives": (replace_drives,),
     "model": (Effects,),
@@ -72,6 +74,8 @@ class Experiment:
     columns: Columns | None  # columns of the logs; None if the file does not say
     # known load that is on the robot in some logs only; None if the file does not say
     load: Tool | float | None
+    # force sensor at the end-effector; None if the file does not say
+    sensor: ForceSensor | None
     # settings of simulations that follow commands, or torques
     rollout: ServoSettings | TorqueSettings
     calibration: CalibrationSettings  # files of poses, and what was measured in them
@@ -135,8 +139,13 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
             robot = call(replace, tables[name], name, robot)
     columns = None
     reading = LogReading()
+    sensor = None
+    if "sensor" in tables:
+        sensor = call(ForceSensor, tables["sensor"], "sensor")
     if "recording" in tables:
-        columns, reading = build_columns(tables["recording"], robot, path.parent)
+        columns, reading = build_columns(
+            tables["recording"], robot, path.parent, getattr(sensor, "wrench", None)
+        )
         require_gears(robot, columns)
     load = None
     if "load" in tables:
@@ -150,6 +159,7 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
         build_setup(tables, robot, robot_file, reading),
         columns,
         load,
+        sensor,
         _build_rollout(tables.get("rollout", {}), reading),
         call(CalibrationSettings, tables.get("calibration", {}), "calibration"),
         _build_excitation(tables.get("excitation", {}), path.parent),

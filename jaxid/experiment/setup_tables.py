@@ -23,6 +23,7 @@ from jaxid.identification.filter_selection import USUAL_CUTOFFS
 from jaxid.identification.uncertainty import UNCERTAINTIES, AbstractUncertainty
 from jaxid.measurement import filters
 from jaxid.measurement.columns import Columns, with_lerobot_calibration
+from jaxid.measurement.log_columns import Selection
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 from jaxid.units import Unit
@@ -222,8 +223,13 @@ SIDES = ("angles_on_motor_side", "forces_on_motor_side", "joint_names")
 """Arguments of `Columns` that `side`, `forces_side` and the robot tell."""
 
 
-def build_columns(table: TomlTable, robot: Robot, folder: Path):
-    """Return the columns of the logs, and how logs are read."""
+def build_columns(
+    table: TomlTable, robot: Robot, folder: Path, wrench: Selection | None = None
+):
+    """Return the columns of the logs, and how logs are read.
+
+    With the columns of a `wrench`, forces of the joints may be missing.
+    """
     table = {key: with_joint_names(value, robot) for key, value in table.items()}
     if "commands" in table:
         # A robot that logs no torque.
@@ -231,6 +237,10 @@ def build_columns(table: TomlTable, robot: Robot, folder: Path):
     arguments, sides, reading = decode(
         [Columns, Sides, LogReading], table, "recording", skip=SIDES
     )
+    if "forces" not in arguments:
+        if wrench is None:
+            raise InputError("`recording.forces` is missing: `[recording]` needs it.")
+        arguments["wrench"] = wrench
     with within("recording"):
         if "lerobot_calibration" in reading:
             path = folder / reading["lerobot_calibration"]

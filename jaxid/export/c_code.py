@@ -9,6 +9,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import Texts
@@ -16,9 +17,12 @@ from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, atomic_folder, fill_template
 from jaxid.program import Program, evaluate, trace
 from jaxid.program.c_writer import CWriter
+from jaxid.robot.robot import Robot
 
 from .feed_forward import other_forces, torques
 
+JOINT_INPUTS = ("q_before", "q", "qd", "qdd")
+"""Inputs with one number for each joint."""
 TEST_SAMPLES = 4
 """Number of states at which the self-test of a file compares its functions."""
 
@@ -76,7 +80,7 @@ def export_c(
 def c_functions(fit: Fit) -> list[CFunction]:
     """Return all functions of a model, with its estimates as constants."""
     model = fit.base.model
-    joints = (model.robot.joints,)
+    joints = (len(model.robot.driven),)
     shapes: dict[str, tuple[int, ...]] = {
         "q_before": joints,
         "q": joints,
@@ -90,9 +94,34 @@ def c_functions(fit: Fit) -> list[CFunction]:
     for name, (summary, output, function) in _definitions(fit).items():
         arguments = inspect.signature(function).parameters
         inputs = [x for x in arguments if x in shapes]
+        if model.robot.rigid:
+            function = without_virtual_joints(model.robot, name, inputs, function)
         program = trace(function, *[shapes[x] for x in inputs])
         functions.append(CFunction(name, summary, program, tuple(inputs), output))
     return functions
+
+
+def without_virtual_joints(
+    robot: Robot, name: str, inputs: Sequence[str], function: Callable
+) -> Callable:
+    """Return a function of driven joints from one of all joints.
+
+    Those of force sensors do not move. The function `wrench` returns their forces, all
+    others those of the driven joints.
+    """
+    driven = np.array(robot.driven)
+    rows = np.array(robot.rigid) if name == "wrench" else driven
+
+    def of_driven_joints(*arguments):
+        all_arguments = []
+        for key, values in zip(inputs, arguments, strict=True):
+            if key in JOINT_INPUTS:
+                values = jnp.zeros(robot.joints, values.dtype).at[driven].set(values)
+            all_arguments.append(values)
+        result = function(*all_arguments)[rows]
+        return result[:, driven] if name == "mass_matrix" else result
+
+    return of_driven_joints
 
 
 def _definitions(fit: Fit) -> dict[str, tuple[str, str, Callable]]:
@@ -155,6 +184,11 @@ def _definitions(fit: Fit) -> dict[str, tuple[str, str, Callable]]:
             base.columns,
         ),
     }
+    if model.robot.rigid:
+        summary = (
+            "Wrench of the force sensors: what is behind them, at any motion, and bias"
+        )
+        functions["wrench"] = (summary, "w", torque)
     if model.memory is not None:
         summary = "State of dry friction after a step of the joints"
         functions["advance"] = (summary, "s_next", model.memory.advance)
@@ -192,7 +226,7 @@ def c_texts(
 def _test_tables(fit: Fit, functions: Sequence[CFunction]) -> dict[str, list]:
     """Return random states and the results of all functions, for the self-test."""
     random = np.random.default_rng(0)
-    shape = (TEST_SAMPLES, fit.base.model.robot.joints)
+    shape = (TEST_SAMPLES, len(fit.base.model.robot.driven))
     parameters = np.asarray(fit.parameters, np.float64)
     arrays = {"p": np.tile(parameters, (TEST_SAMPLES, 1))}
     tables = {}

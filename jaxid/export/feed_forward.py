@@ -1,5 +1,6 @@
 """The feed-forward of a controller as a scalar program with few operations (Eq. 39)."""
 
+import functools
 from collections.abc import Callable
 from typing import Any
 
@@ -43,6 +44,9 @@ def other_forces(fit: Fit) -> Callable[..., Any]:
 def torques(fit: Fit) -> Callable[..., Any]:
     """Return the function of one sample for the forces of a fit."""
     model = fit.base.model
+    if model.robot.virtual:
+        # The forces of virtual joints belong to these bodies and no others.
+        return functools.partial(model.forces, fit.standard_parameters)
     bodies = body_parameters(model, fit.standard_parameters)
     description = simplest_description(model.robot, bodies)
     remaining_forces = other_forces(fit)

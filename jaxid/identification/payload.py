@@ -1,9 +1,16 @@
-"""Payload: the difference between a run without a load and a run with it."""
+"""Payload: what runs with a load have more than runs without it, or than the sensor.
+
+Behind a force sensor everything is payload if no run without it is given.
+"""
+
+from collections.abc import Iterator, Sequence
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 
 from jaxid.arrays import (
     AnyArray,
@@ -24,8 +31,8 @@ from jaxid.result_table import (
     percent,
     significant,
 )
-from jaxid.robot.inertia import INERTIAL_NAMES, Inertia
-from jaxid.robot.robot import Robot, Tool
+from jaxid.robot.inertia import INERTIAL_NAMES, Inertia, Tool
+from jaxid.robot.robot import Robot
 
 from .combination import (
     as_least_squares,
@@ -35,6 +42,7 @@ from .combination import (
 )
 from .consistency import BodyBounds, consistency_margin, consistent_body
 from .fit_result import Fit, interval_table
+from .force_sensor import SensorEstimates, sensor_estimates
 from .operating_states import state_maps, varying_parameters
 from .uncertainty import Uncertainty
 
@@ -55,6 +63,8 @@ CENTRAL_WORDS = (
 
 Body = Float[AnyArray, "10"]
 """Parameters $(m, m r_c, A, B, C, D, E, F)$ of a body."""
+Runs = Fit | Sequence[Fit]
+"""Fit of one run, or of several."""
 
 MAX_DISTANCE = 4.0
 """Standard deviations from the estimate to a possible body that are not unusual."""
@@ -62,8 +72,13 @@ MAX_RESIDUAL_RATIO = 2.0
 """Ratio of the residuals with and without a load that is not unusual."""
 SMALL_RESIDUAL = 0.01
 """Residual that says nothing of a load, relative to the forces."""
+MIN_DRIFT_CHANCE = 0.01
+"""Probability of the differences between biases by chance, below which they drift."""
 SCALE_DEVIATION = 1e-3
 """Standard deviation of a weighed mass, relative to it."""
+INERTIA_RADIUS = 0.1
+"""Distance at which the load's mass has a moment that is told: less certain ones are
+not [m]."""
 MAX_ERROR_BOUND = 0.01
 """Relative error bound of half the squared distance to the nearest body.
 
@@ -86,8 +101,9 @@ class Payload(Summarised, eqx.Module):
             robot is lighter with the load.
         base_parameters: Base parameters of the robot without the load and with it; they
             differ by the load, friction and offsets alone.
-        residuals: Residual of the fit without the load, and of the model with the load,
-            relative to the forces.
+        residuals: Residual of the fit without the load (NaN if there is none), and of
+            the model with the load, relative to the forces.
+        sensor: Bias and rotation of the force sensor; None without a sensor.
     """
 
     body: int = eqx.field(static=True)
@@ -97,6 +113,7 @@ class Payload(Summarised, eqx.Module):
     distance: float
     base_parameters: tuple[BaseVector, BaseVector]
     residuals: tuple[float, float]
+    sensor: SensorEstimates | None = None
 
     @property
     def mass(self) -> float:
@@ -110,12 +127,26 @@ class Payload(Summarised, eqx.Module):
 
     @property
     def inertia(self) -> Matrix3:
-        """Inertia tensor about the centre of mass, along the body's axes [kg m²]."""
+        """Inertia tensor about the centre of mass, along the body's axes [kg m²].
+
+        NaN where the runs do not determine it.
+        """
+        if not self.has_inertia:
+            return np.full((3, 3), np.nan)
         return np.asarray(Inertia.from_parameters(self.parameters).tensor)
+
+    @property
+    def has_inertia(self) -> bool:
+        """Whether the runs determine the moments of inertia: static poses do not."""
+        _, uncertainty = self.central
+        half_widths = uncertainty.half_widths()[4:7]
+        return bool(half_widths.max() < abs(self.mass) * INERTIA_RADIUS**2)
 
     @property
     def tool(self) -> Tool:
         """The payload as a known load: `robot.replace(tool=payload.tool)`.
+
+        A point mass if the runs do not determine its inertia.
 
         Raises:
             InputError: If it is no body that can exist.
@@ -124,7 +155,7 @@ class Payload(Summarised, eqx.Module):
             self.body,
             mass=self.mass,
             centre_of_mass=self.centre_of_mass,
-            inertia=self.inertia,
+            inertia=self.inertia if self.has_inertia else None,
         )
 
     @property
@@ -146,22 +177,62 @@ class Payload(Summarised, eqx.Module):
         )
 
     def summary(self) -> Table:
-        """Return a table of mass, centre, moments about it, and consistency."""
-        values, uncertainty = self.central
+        """Return a table of mass, centre, moments about it, and consistency.
+
+        Bias and rotation of a force sensor follow, if there is one.
+        """
+        central_values, uncertainty = self.central
+        is_told = np.arange(10) < (10 if self.has_inertia else 4)
+        values = np.where(is_told, central_values, np.nan)
+        names, units, words = CENTRAL_NAMES, CENTRAL_UNITS, CENTRAL_WORDS
+        covariance = uncertainty.covariance
+        dof = uncertainty.dof
+        if self.sensor is not None:
+            sensor = self.sensor.in_degrees
+            names = (*names, *sensor.names)
+            units = (*units, *sensor.units)
+            words = (*words, *sensor.words)
+            values = np.append(values, sensor.values)
+            covariance = scipy.linalg.block_diag(
+                covariance, sensor.uncertainty.covariance
+            )
+            dof = np.append(dof, sensor.uncertainty.dof)
         return interval_table(
             "payload in the frame of its body; moments about the centre of mass",
-            CENTRAL_NAMES,
-            CENTRAL_UNITS,
+            names,
+            units,
             values,
-            uncertainty,
-            [self._remark()],
-            CENTRAL_WORDS,
+            Uncertainty(covariance, dof, covariance),
+            [*self._remarks()],
+            words,
         )
+
+    @property
+    def has_drifting_bias(self) -> bool:
+        """Whether the biases of several runs differ by more than chance."""
+        return self.sensor is not None and self.sensor.drift_chance < MIN_DRIFT_CHANCE
 
     @property
     def is_lighter(self) -> bool:
         """Whether the robot is lighter with the load than without it."""
         return _is_negative(self.estimate, self.uncertainty)
+
+    def _remarks(self) -> Iterator[Remark]:
+        """Yield whether the payload is a body that could exist, and what is open."""
+        remark = self._remark()
+        yield remark
+        if remark.status is not Status.BAD and not self.has_inertia:
+            yield Remark(
+                "The runs do not determine the moments of inertia, as slow motion or "
+                "poses at rest never do: the table leaves them out. Mass and centre "
+                "are determined without them. Move the load faster if they are needed.",
+                Status.DOUBTFUL,
+            )
+        if self.has_drifting_bias:
+            yield Remark(
+                "The bias of the force sensor drifts: each part of the log has its "
+                "own, and the table holds that of the last part."
+            )
 
     def _remark(self) -> Remark:
         """Return whether the payload is a body that could exist."""
@@ -184,12 +255,14 @@ class Payload(Summarised, eqx.Module):
                 "forces? Set it to zero there, and record again.",
                 Status.BAD,
             )
-        if not np.isfinite(self.distance):
+        if not np.isfinite(self.uncertainty.covariance[:4, :4]).all():
             return Remark(
-                "The logs do not determine all ten parameters of the payload: move the "
-                "joints that carry it in more poses, faster, and alike in both runs.",
+                "The logs do not determine mass and centre of the payload: move the "
+                "joints that carry it in more poses, and alike in both runs.",
                 Status.BAD,
             )
+        if not np.isfinite(self.distance):
+            return Remark("Whether such a body can exist is not known.")
         if self.distance > 0:
             is_usual = self.distance < MAX_DISTANCE
             return Remark(
@@ -202,68 +275,120 @@ class Payload(Summarised, eqx.Module):
 
 
 def identify_payload(
-    unloaded: Fit,
-    loaded: Fit,
+    unloaded: Runs | None,
+    loaded: Runs,
     *,
     body: int | None = None,
     mass: float | None = None,
 ) -> Payload:
-    """Identify a payload from a run without it and a run with it.
+    """Identify a payload from runs without it and runs with it.
 
-    Both are fitted together. What the payload adds to the base parameters depends on
-    its ten parameters alone, and these are determined all ten although the last body's
-    own are not: the robot without the payload is known from the other run. Friction and
-    offsets may differ between the runs, since they change with load and temperature.
-    Uncertainties of both runs count.
+    All are fitted together. What the payload adds to the base parameters depends on its
+    ten parameters alone, and these are determined all ten although the last body's own
+    are not: the robot without the payload is known from the other run. Friction and
+    offsets may differ between the runs, since they change with load and temperature,
+    and so may the bias of a force sensor. Uncertainties of all runs count.
 
     Args:
-        unloaded: Fit of the run without the payload.
-        loaded: Fit of the run with it.
+        unloaded: Fit of the run without the payload, or fits of several. None if a
+            force sensor measures what is behind it: then all of that is payload.
+        loaded: Fit of the run with it, or fits of several.
         body: Index of the body that carries it; that of the end-effector if None.
         mass: Mass of the payload [kg] if a scale has told it (to 0.1 %): the rest is
             then known better.
 
     Raises:
         InputError: If the runs have different base parameters or have seen the same
-            data, or the model does not have ten parameters for the body.
+            data, the model does not have ten parameters for the body, or there are no
+            runs without the payload and no sensor.
         RuntimeError: If no body was proved to be the nearest.
     """
-    require_same_base((unloaded, loaded))
-    base = unloaded.base
-    body = base.model.robot.tip_body if body is None else body
-    columns = body_columns(base, body)
-    fits = (as_least_squares(unloaded), as_least_squares(loaded))
-    estimate, uncertainty = _estimate(fits, columns)
+    runs = _joined_runs(_as_fits(unloaded), _as_fits(loaded), body)
+    base = runs.fits[0].base
+    values, all_uncertainty = combine(runs.fits, runs.maps)
+    estimate = values[-10:]
+    # Parameters about the centre of mass are combinations: the fewest count for all.
+    covariance = all_uncertainty.covariance[-10:, -10:]
+    dof = np.full(10, np.min(all_uncertainty.dof[-10:]))
+    uncertainty = Uncertainty(covariance, dof, covariance)
     if mass is not None and not _is_negative(estimate, uncertainty):
         estimate, uncertainty = _weigh(estimate, uncertainty, mass)
     parameters, distance = _possible_body(estimate, uncertainty, base.model.robot)
-    base_parameters = _robot_with_load(fits, columns @ parameters)
-    loaded_residual = relative_residual(fits[1], base_parameters[1])
+    base_parameters = _robot_with_load(runs, parameters)
+    residual = runs.fits[0].residual if runs.unloaded else np.nan
     return Payload(
-        body=body,
+        body=runs.body,
         parameters=parameters,
         estimate=estimate,
         uncertainty=uncertainty,
         distance=distance,
         base_parameters=base_parameters,
-        residuals=(fits[0].residual, loaded_residual),
+        residuals=(residual, relative_residual(runs.fits[-1], base_parameters[1])),
+        sensor=sensor_estimates(
+            base, runs.maps[runs.unloaded :], values, all_uncertainty
+        ),
     )
 
 
-def _estimate(fits: tuple[Fit, Fit], columns: Matrix):
-    """Return the parameters that a load on a body has added between two runs."""
+class _LoadRuns(NamedTuple):
+    """Fits of the runs without the load, then with it, and what they have in common.
+
+    Attributes:
+        fits: Fits, as least squares.
+        unloaded: Number of fits without the load.
+        body: Index of the body that carries it.
+        maps: For each fit the matrix [base, unknowns] from all unknowns, of which the
+            last ten are the load's, to its base parameters.
+    """
+
+    fits: tuple[Fit, ...]
+    unloaded: int
+    body: int
+    maps: list[Matrix]
+
+
+def _as_fits(runs: Runs | None) -> tuple[Fit, ...]:
+    """Return one fit or several as a tuple; an empty one for None."""
+    if runs is None:
+        return ()
+    fits = (runs,) if isinstance(runs, Fit) else runs
+    return tuple(map(as_least_squares, fits))
+
+
+def _joined_runs(
+    unloaded: tuple[Fit, ...], loaded: tuple[Fit, ...], body: int | None
+) -> _LoadRuns:
+    """Return the runs, and how their base parameters follow from common unknowns."""
+    fits = (*unloaded, *loaded)
+    require_same_base(fits)
     base = fits[0].base
-    states = state_maps(base.size, varying_parameters(base), 2)
-    # The payload's ten parameters are unknowns that only the loaded run has.
-    maps = [
-        np.hstack([states[0], np.zeros_like(columns)]),
-        np.hstack([states[1], columns]),
-    ]
-    values, uncertainty = combine(fits, maps)
-    covariance = uncertainty.covariance[-10:, -10:]
-    # Parameters about the centre of mass are combinations: the fewest count for all.
-    dof = np.full(10, np.min(uncertainty.dof[-10:]))
-    return values[-10:], Uncertainty(covariance, dof, covariance)
+    body = base.model.robot.tip_body if body is None else body
+    columns = body_columns(base, body)
+    states = state_maps(base.size, varying_parameters(base), len(fits))
+    if not unloaded:
+        states = [_without_own_parameters(state, columns) for state in states]
+    maps = []
+    for number, state in enumerate(states):
+        # The payload's ten parameters are unknowns that only loaded runs have.
+        is_loaded = number >= len(unloaded)
+        maps.append(np.hstack([state, is_loaded * columns]))
+    return _LoadRuns(fits, len(unloaded), body, maps)
+
+
+def _without_own_parameters(state: Matrix, columns: Matrix) -> Matrix:
+    """Return the map of a run whose body behind the sensor is the load alone.
+
+    Raises:
+        InputError: If the body's ten parameters are no base parameters themselves, as
+            they are behind a sensor.
+    """
+    if np.linalg.matrix_rank(columns) < 10 or np.count_nonzero(columns) > 10:
+        raise InputError(
+            "`unloaded` must hold a run without the payload, since no force sensor "
+            "measures the payload alone: give one, or use `robot.with_sensor()`."
+        )
+    own_parameters = columns.any(axis=1)
+    return np.delete(state, state[own_parameters].argmax(axis=1), axis=1)
 
 
 def _possible_body(
@@ -287,14 +412,12 @@ def _possible_body(
     return parameters, distance
 
 
-def _robot_with_load(
-    fits: tuple[Fit, Fit], load: BaseVector
-) -> tuple[BaseVector, BaseVector]:
+def _robot_with_load(runs: _LoadRuns, load: Body) -> tuple[BaseVector, BaseVector]:
     """Return the base parameters without and with a load that is known."""
-    base = fits[0].base
-    states = state_maps(base.size, varying_parameters(base), 2)
-    values, _ = combine(fits, states, [np.zeros(base.size), load])
-    return states[0] @ values, states[1] @ values + load
+    states = [matrix[:, :-10] for matrix in runs.maps]
+    loads = [matrix[:, -10:] @ load for matrix in runs.maps]
+    values, _ = combine(runs.fits, states, loads)
+    return states[0] @ values, states[-1] @ values + loads[-1]
 
 
 def _is_negative(estimate: AnyArray, uncertainty: Uncertainty) -> bool:
@@ -327,7 +450,7 @@ def body_columns(base: BaseParameters, body: int) -> np.ndarray:
     names = list(base.model.parameter_names)
     columns = []
     for symbol in INERTIAL_NAMES:
-        name = f"{symbol}{body + 1}"
+        name = f"{symbol}{base.model.robot.numbers[body]}"
         if name not in names:
             raise InputError(
                 f"the model lacks `{name}` of body {body}: use `RigidBodies()`."

@@ -37,8 +37,10 @@ COUNTER_SIZE = 2**16
 """Number after which counters of drives begin again."""
 MIN_OVERFLOW = 0.75
 """Smallest step of a counter that begins again, relative to its size."""
-Channels = tuple[Matrix, Matrix | None, Matrix]
-"""Angles, velocities (None if there are none) and forces (samples x joints)."""
+Channels = tuple[Matrix, Matrix | None, Matrix | None]
+"""Angles, velocities and forces (samples x joints); None where there are none."""
+NOT_OF_JOINTS = ("time", "wrench")
+"""Channels that do not have one column for each joint."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,12 +90,16 @@ class Columns:
             gears.
         forces_on_motor_side: Whether forces are the motors', before the gears.
         unwrap: Whether to remove jumps of the angles by full turns.
+        wrench: Three forces and three moments of a force sensor [N, N m]; with them
+            `forces` may be None.
+        wrench_sign: 1 for the wrench of the sensor on what is behind it, -1 for the
+            opposite one.
         joint_names: Names of the robot's joints: arrays of bags are read by them, if
             the messages name their elements so; by place if None.
     """
 
     angles: Selection
-    forces: Selection
+    forces: Selection | None = None
     velocities: Selection | None = None
     time: str | int | tuple[str | int, str | int] | None = None
     sample_time: float | None = None
@@ -112,6 +118,8 @@ class Columns:
     angles_on_motor_side: bool = False
     forces_on_motor_side: bool = False
     unwrap: bool = False
+    wrench: Selection | None = None
+    wrench_sign: float = 1.0
     joint_names: tuple[str, ...] | None = None
 
     def __post_init__(self) -> None:
@@ -125,6 +133,10 @@ class Columns:
             )
         if self.sample_time is not None:
             positive_time(self.sample_time)
+        if self.forces is None and self.wrench is None:
+            raise InputError(
+                "`forces` is missing: it names the columns of the forces of the joints."
+            )
         self._require_unit("time_unit", Quantity.TIME)
         self._require_unit("angle_unit", Quantity.COORDINATE, Quantity.SHARE)
         self._require_unit("velocity_unit", Quantity.VELOCITY, Quantity.SHARE)
@@ -189,7 +201,7 @@ class Columns:
             )
 
     def to_si(
-        self, angles: Matrix, velocities: Matrix | None, forces: Matrix
+        self, angles: Matrix, velocities: Matrix | None, forces: Matrix | None
     ) -> Channels:
         """Convert the numbers of a log to SI units (samples x joints)."""
         joints = angles.shape[1]
@@ -215,7 +227,9 @@ class Columns:
         gains = numbers("force_unit") * numbers("force_signs") * numbers("force_gains")
         force_scale = gains * numbers("torque_constants") * numbers("rated_forces")
         offsets = numbers("angle_offsets", 0.0)
-        return angles * angle_scale + offsets, velocities, forces * force_scale
+        if forces is not None:
+            forces = forces * force_scale
+        return angles * angle_scale + offsets, velocities, forces
 
 
 def with_lerobot_calibration(
@@ -301,12 +315,8 @@ class Log:
         """Return angles, velocities and forces of some rows, as they were recorded."""
         arrays: dict[str, Matrix] = {}
         for table in self.tables:
-            channels = [channel for channel in table.channels if channel != "time"]
-            part = table.read(channels, start, stop)
-            for channel, names in part.channels.items():
-                blocks = {name: part.numbers(name) for name in names}
-                _require_values(table.source, channel, blocks)
-                array = np.concatenate([*blocks.values()], axis=1)
+            channels = [x for x in table.channels if x not in NOT_OF_JOINTS]
+            for channel, array in _numbers(table, channels, start, stop).items():
                 # A part does not tell how often a counter began again before.
                 is_part = start > 0 or stop is not None
                 arrays[channel] = (
@@ -320,8 +330,24 @@ class Log:
                     f"`{self.tables[0].source}` have {joints}: name one for each "
                     "joint."
                 )
-        velocities = arrays.get("velocities")
-        return self.columns.to_si(arrays["angles"], velocities, arrays["forces"])
+        return self.columns.to_si(
+            arrays["angles"], arrays.get("velocities"), arrays.get("forces")
+        )
+
+    def wrench(self) -> Matrix:
+        """Return the wrench that a force sensor exerts on what is behind it [N, N m].
+
+        Raises:
+            InputError: If there are not three forces and three moments.
+        """
+        table = self.tables[0]
+        values = _numbers(table, ["wrench"], 0, None)["wrench"]
+        if values.shape[1] != 6:
+            raise InputError(
+                f"`wrench` has {values.shape[1]} columns in `{table.source}`, but must "
+                "name three forces, then three moments."
+            )
+        return self.columns.wrench_sign * values
 
     def _without_overflows(self, channel: str, array: Matrix) -> Matrix:
         """Return a channel whose counter goes on where it began again; note it."""
@@ -355,6 +381,19 @@ class Log:
         """Return time stamps [s]; integers and dates count from `start`."""
         table = self.tables[0].read(("time",), start, stop)
         return table.stamps(self.columns.time_unit.factor)
+
+
+def _numbers(
+    table: LogTable, channels: Sequence[str], start: int, stop: int | None
+) -> dict[str, Matrix]:
+    """Return the numbers of some channels of a file, as they were recorded."""
+    part = table.read(channels, start, stop)
+    arrays = {}
+    for channel, names in part.channels.items():
+        blocks = {name: part.numbers(name) for name in names}
+        _require_values(table.source, channel, blocks)
+        arrays[channel] = np.concatenate([*blocks.values()], axis=1)
+    return arrays
 
 
 def _require_values(source: str, channel: str, blocks: dict[str, Matrix]) -> None:
@@ -394,8 +433,11 @@ def open_log(
         )
     channels: dict[str, tuple[FilePath, Selection | None]] = {
         "angles": (path, columns.angles),
-        "forces": (forces_path or path, columns.forces),
     }
+    if columns.forces is not None:
+        channels["forces"] = (forces_path or path, columns.forces)
+    if columns.wrench is not None:
+        channels["wrench"] = (path, columns.wrench)
     if columns.velocities is not None:
         channels["velocities"] = (velocities_path or path, columns.velocities)
     if columns.time is not None or columns.sample_time is None:

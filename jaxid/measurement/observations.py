@@ -25,6 +25,12 @@ from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 
 from .filters import AbstractDecimation, AbstractFilter, Subsample, ZeroPhaseButterworth
+from .force_sensors import (
+    measured_joints,
+    on_all_joints,
+    refuse_missing_wrench,
+    speeds_of_all_joints,
+)
 from .recording import (
     Recording,
     consecutive,
@@ -41,12 +47,7 @@ from .samples import (
     joined,
     joint_side,
 )
-from .time_grid import Range, Ranges, TimeGrid
-
-MIN_ROWS = 4
-"""Smallest number of rows for which a segment is used."""
-MIN_SEGMENT = 5
-"""Smallest number of samples of a segment: differences of fourth order need them."""
+from .time_grid import Range, Ranges, TimeGrid, usable_segments
 
 Progress = Callable[[float], None]
 """Callback, called with the completed fraction (0 to 1)."""
@@ -369,29 +370,38 @@ def observe(
             notes = (note,)
             recording = dataclasses.replace(recording, velocities=None)
 
+    refuse_missing_wrench(recording, robot)
+    measured_forces = recording.forces
+    if measured_forces is None:
+        measured_forces = np.zeros(recording.angles.shape)
+
     def load(segments: Iterable[Range]) -> SamplesInMemory:
         q, qd, forces = joint_side(
-            robot, recording, recording.angles, recording.velocities, recording.forces
+            robot, recording, recording.angles, recording.velocities, measured_forces
         )
         parts = []
         for a, b in segments:
             segment_qd = None if qd is None else qd[a:b]
             motion = filter.motion(q[a:b], segment_qd, recording.sample_time)
-            parts.append((motion, forces[a:b]))
+            samples = (motion, forces[a:b])
+            if recording.wrench is not None:
+                samples = on_all_joints(robot, *samples, recording.wrench[a:b])
+            parts.append(samples)
         return SamplesInMemory(*joined(parts))
 
     observations = prepare(
         load,
         recording.grid,
-        recording.joints,
+        recording.joints + len(robot.virtual),
         recording.velocities is not None,
         robot,
         filter,
         decimation,
-        min_speed,
+        speeds_of_all_joints(robot, min_speed),
         recording.name if name is None else name,
     )
-    return observations.replace(notes=(*observations.notes, *notes))
+    mask = observations.mask & measured_joints(robot, recording)
+    return observations.replace(notes=(*observations.notes, *notes), mask=mask)
 
 
 def prepare(
@@ -411,10 +421,11 @@ def prepare(
     For the other arguments see `observe` and `scan_log`.
     """
     if joints != robot.joints:
+        virtual = len(robot.virtual)
         raise InputError(
-            f"`{name}` has {joints} joints, but the robot `{robot.name}` has "
-            f"{robot.joints}: choose the columns of its joints, or the robot of this "
-            "log."
+            f"`{name}` has {joints - virtual} joints, but the robot `{robot.name}` has "
+            f"{robot.joints - virtual}: choose the columns of its joints, or the robot "
+            "of this log."
         )
     decimation = Subsample(1) if decimation is None else decimation
     dt = grid.sample_time
@@ -423,7 +434,7 @@ def prepare(
         edge = filter.edge(dt)
     except InputError as error:
         raise InputError(f"`{name}`: {error}") from error
-    grid = _usable_segments(grid, edge, decimation.factor, name)
+    grid = usable_segments(grid, edge, decimation.factor, name)
     notes = grid.notes
     if has_velocities and not filter.uses_velocities:
         kind = type(filter).__name__
@@ -455,32 +466,6 @@ def prepare(
             f"`min_speed` in `{name}`: use a smaller one, or a log in which it moves."
         )
     return observations.replace(mask=mask)
-
-
-def _usable_segments(grid: TimeGrid, edge: int, factor: int, name: str) -> TimeGrid:
-    """Return the segments that are long enough for a filter with edges, and rows."""
-    row_samples = (MIN_ROWS - 1) * factor + 1
-    min_samples = max(2 * edge + row_samples, MIN_SEGMENT)
-    segments = {
-        (a, b): t for (a, b), t in grid.segments.items() if b - a >= min_samples
-    }
-    if not segments:
-        samples = max(b - a for a, b in grid.segments)
-        raise InputError(
-            f"the longest segment of `{name}` has {samples} samples at "
-            f"{1 / grid.sample_time:.6g} Hz, but the filter removes {edge} at each "
-            f"end, and {MIN_ROWS * factor} more are needed: "
-            f"{grid.cure_of_short_segments}."
-        )
-    notes = grid.notes
-    lost_segments = len(grid.segments) - len(segments)
-    if lost_segments:
-        note = (
-            f"{lost_segments} segment(s), shorter than the filter's edges, were left "
-            "out"
-        )
-        notes = (*notes, note)
-    return TimeGrid(grid.sample_time, segments, notes)
 
 
 def _speed_mask(

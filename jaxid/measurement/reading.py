@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import equinox as eqx
 import numpy as np
@@ -80,9 +80,13 @@ def read_recording(
     stamps = log.stamps() if sample_time is None else None
     complaints = log.bad_rows
     notes = [*log.notes, *(note for table in log.tables for note in table.notes)]
-    channels = {"angles": angles, "forces": forces}
-    if velocities is not None:
-        channels["velocities"] = velocities
+    measured_channels = {
+        "angles": angles,
+        "forces": forces,
+        "velocities": velocities,
+        "wrench": None if columns.wrench is None else log.wrench(),
+    }
+    channels = {name: x for name, x in measured_channels.items() if x is not None}
     is_row = np.ones(len(angles), bool)
     is_row[[row for row, text in complaints.items() if COMMENT in text]] = False
     if not is_row.all():
@@ -129,8 +133,9 @@ def read_recording(
     channels = {name: values[good_rows] for name, values in channels.items()}
     if columns.unwrap:
         channels["angles"] = np.unwrap(channels["angles"], axis=0)
+    measured: dict[str, Any] = {"forces": None, **channels}
     recording = Recording.of(
-        **channels,
+        **measured,
         time=None if stamps is None else stamps[good_rows],
         sample_time=sample_time,
         angles_on_motor_side=columns.angles_on_motor_side,
@@ -266,7 +271,7 @@ class SamplesOnDisk(AbstractSamples):
         # With the neighbours that the filter needs.
         start = max(a, samples.start - self.overlap)
         stop = min(b, samples.stop + self.overlap)
-        channels = self.read_rows(slice(start, stop))
+        channels: Any = self.read_rows(slice(start, stop))
         q, qd, forces = joint_side(self.robot, self.log.columns, *channels)
         motion = self.filter.motion(q, qd, self.sample_time)
 
@@ -334,6 +339,8 @@ def scan_log(
         InputError: If the file is of another kind, its columns are not the robot's,
             forces and columns would be aliased, or no samples are left.
     """
+    if columns.wrench is not None:
+        raise NeedsMemory("the wrench of a force sensor is read with whole logs")
     if columns.unwrap:
         raise NeedsMemory("`unwrap` counts the turns of whole logs")
     log = open_log(path, columns, forces_path, velocities_path, on_disk=True)

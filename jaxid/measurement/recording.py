@@ -36,7 +36,7 @@ class Recording(eqx.Module):
         time: Times of the samples, uniform within each segment [s].
         angles: Angles of joints or motors, as the robot reported them, unfiltered [rad
             or m].
-        forces: Forces of joints or motors [N m or N].
+        forces: Forces of joints or motors [N m or N]; None if not measured.
         velocities: Measured velocities, on the angles' side [rad/s or m/s]; None if not
             measured.
         angles_on_motor_side: Whether angles and velocities are the motors'.
@@ -48,11 +48,13 @@ class Recording(eqx.Module):
         stamp_deviation: Largest deviation of the time stamps from a uniform grid, in
             sample times; None if the sample time was given instead.
         angle_unit: Unit of the angles in the file, for messages.
+        wrench: Force and moment that each force sensor exerts on what is behind it [N,
+            N m]; None if there are none.
     """
 
     time: Float[AnyArray, " samples"]
     angles: JointSamples
-    forces: JointSamples
+    forces: JointSamples | None
     velocities: JointSamples | None
     angles_on_motor_side: bool = eqx.field(static=True)
     forces_on_motor_side: bool = eqx.field(static=True)
@@ -62,14 +64,16 @@ class Recording(eqx.Module):
     notes: Texts = eqx.field(static=True, default=())
     stamp_deviation: float | None = eqx.field(static=True, default=None)
     angle_unit: str = eqx.field(static=True, default="rad")
+    wrench: Float[AnyArray, "samples wrenches"] | None = None
 
     @classmethod
     def of(
         cls,
         angles: ArrayLike,
-        forces: ArrayLike,
+        forces: ArrayLike | None,
         *,
         velocities: ArrayLike | None = None,
+        wrench: ArrayLike | None = None,
         time: ArrayLike | None = None,
         sample_time: float | int | None = None,
         angles_on_motor_side: bool = False,
@@ -87,8 +91,11 @@ class Recording(eqx.Module):
 
         Args:
             angles: Angles of joints or motors [rad or m].
-            forces: Forces of joints or motors [N m or N].
+            forces: Forces of joints or motors [N m or N]; None if only wrenches are
+                measured.
             velocities: Measured velocities [rad/s or m/s].
+            wrench: Force and moment that each force sensor exerts on what is behind it:
+                three forces [N], three moments [N m].
             time: Time stamps [s]; either they or `sample_time`.
             sample_time: Time between two samples [s].
             angles_on_motor_side: Whether angles and velocities are the motors'.
@@ -114,6 +121,11 @@ class Recording(eqx.Module):
             for key, x in channels.items()
         }
         samples = len(data["angles"])
+        if wrench is None and forces is None:
+            raise InputError(f"`{name}` needs `forces` or a `wrench`, but has neither.")
+        if wrench is not None:
+            size = (samples, np.shape(wrench)[-1])
+            data["wrench"] = finite_channel(name, "wrench", wrench, size, first_row)
         if samples < MIN_SAMPLES:
             raise InputError(
                 f"`{name}` has {samples} samples, but at least {MIN_SAMPLES} are "
@@ -333,9 +345,15 @@ def _without_delay(segment: Recording, seconds: float, lost_samples: int) -> dic
     return {
         "time": time[samples],
         "angles": shift(segment.angles),
-        "forces": np.asarray(segment.forces)[samples],
+        "forces": _part(segment.forces, samples),
         "velocities": None if qd is None else shift(qd),
+        "wrench": _part(segment.wrench, samples),
     }
+
+
+def _part(values: AnyArray | None, samples: slice) -> AnyArray | None:
+    """Return some samples of a channel; None if it is not measured."""
+    return None if values is None else np.asarray(values)[samples]
 
 
 def require_finite_delay(seconds: float) -> None:

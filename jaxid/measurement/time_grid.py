@@ -20,6 +20,10 @@ MIN_SEGMENT = 4
 """Smallest number of rows without a gap that can be a segment."""
 MIN_LIKELY_SAMPLE_TIME = 5e-5
 """Sample time below which the unit of the time is likely to be wrong [s]."""
+MIN_ROWS = 4
+"""Smallest number of rows for which a segment is used."""
+MIN_FILTERED = 5
+"""Smallest number of samples of a segment: differences of fourth order need them."""
 MIN_SAMPLES = 10
 """Smallest number of samples that can be filtered."""
 
@@ -86,6 +90,32 @@ class TimeGrid(NamedTuple):
                 f"{end:g} s."
             )
         return self._replace(segments=segments)
+
+
+def usable_segments(grid: TimeGrid, edge: int, factor: int, name: str) -> TimeGrid:
+    """Return the segments that are long enough for a filter with edges, and rows."""
+    row_samples = (MIN_ROWS - 1) * factor + 1
+    min_samples = max(2 * edge + row_samples, MIN_FILTERED)
+    segments = {
+        (a, b): t for (a, b), t in grid.segments.items() if b - a >= min_samples
+    }
+    if not segments:
+        samples = max(b - a for a, b in grid.segments)
+        raise InputError(
+            f"the longest segment of `{name}` has {samples} samples at "
+            f"{1 / grid.sample_time:.6g} Hz, but the filter removes {edge} at each "
+            f"end, and {MIN_ROWS * factor} more are needed: "
+            f"{grid.cure_of_short_segments}."
+        )
+    notes = grid.notes
+    lost_segments = len(grid.segments) - len(segments)
+    if lost_segments:
+        note = (
+            f"{lost_segments} segment(s), shorter than the filter's edges, were left "
+            "out"
+        )
+        notes = (*notes, note)
+    return TimeGrid(grid.sample_time, segments, notes)
 
 
 class StepStatistics(NamedTuple):

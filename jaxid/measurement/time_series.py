@@ -56,7 +56,8 @@ def without_filling(channels: NamedChannels) -> NamedChannels:
         name: np.append(True, np.diff(values, axis=0).any(axis=1))
         for name, values in channels.items()
     }
-    rows = np.stack([changes["angles"], changes["forces"]])
+    measured_name = "forces" if "forces" in changes else "wrench"
+    rows = np.stack([changes["angles"], changes[measured_name]])
     smaller_count = rows.sum(axis=1).min()
     is_filled = (
         smaller_count >= MIN_CHANGES
@@ -162,7 +163,7 @@ def hold_notes(channels: NamedChannels, sample_time: float) -> list[str]:
         if length > MIN_HELD_ROWS and is_even:
             rate = 1.0 / (length * sample_time)
             cure = "leave `velocities` out, or record them faster"
-            if channel == "forces":
+            if channel in ("forces", "wrench"):
                 delay = 0.5 * (length - 1.0) * sample_time
                 cure = (
                     "unless the drive itself holds the values, remove their delay "

@@ -34,7 +34,11 @@ def model_force_figure(predictions: Predictions, robot: Robot, title: str) -> Fi
         robot: Robot of the log.
         title: Title of the figure.
     """
-    panels = [_joint_panel(predictions, robot, j) for j in range(robot.joints)]
+    errors = np.asarray(next(iter(predictions.values())).errors)
+    # Forces of some joints may not be measured.
+    is_measured = np.isfinite(errors).any(axis=0)
+    joints = np.flatnonzero(is_measured).tolist()
+    panels = [_joint_panel(predictions, robot, j) for j in joints]
     columns = 2 if len(panels) > 2 else 1
     return Figure(title, panels, columns, height=3.2)
 

@@ -44,6 +44,13 @@ def payload_answer(
     """
     joint = robot.body_names[payload.body]
     residual, loaded_residual = map(percent, payload.residuals)
+    comparison = (f"{residual} %", "torque error on the logs without the payload")
+    if payload.sensor is not None:
+        rotation = np.rad2deg(np.linalg.norm(payload.sensor.rotation))
+        comparison = (
+            f"{significant(rotation, 2)} deg",
+            "rotation of the force sensor against its description",
+        )
     half_widths = payload.uncertainty.half_widths()
     mass, half_width = with_deviation(payload.mass, half_widths[0])
     figures = []
@@ -69,12 +76,12 @@ def payload_answer(
                 f"{loaded_residual} %",
                 "torque error (RMS over RMS) on the logs with the payload",
             ),
-            (f"{residual} %", "torque error on the logs without the payload"),
+            comparison,
         ],
         figures,
         f"All values are in the frame of the body that {joint} moves. A_c to F_c are "
         "about the centre of mass, along the axes of this frame.",
-        tool_lines(payload, joint),
+        tool_lines(payload, robot),
     )
 
 
@@ -92,20 +99,32 @@ def payload_figure(payload: Payload, robot: Robot, log: TorqueErrors) -> Figure:
     )
 
 
-def tool_lines(payload: Payload, joint: str) -> list[str]:
+def tool_lines(payload: Payload, robot: Robot) -> list[str]:
     """Return the table of an experiment file that subtracts a payload."""
-    entries = []
-    for i, j in zip(*np.triu_indices(3), strict=True):
-        entries.append(f"{'xyz'[i]}{'xyz'[j]} = {payload.inertia[i, j]:.6g}")
-    centre = [f"{value:.6g}" for value in payload.centre_of_mass]
-    return [
+    joint = robot.body_names[payload.body]
+    centre_of_mass = payload.centre_of_mass
+    inertia = payload.inertia
+    if payload.sensor is not None:
+        # The body behind the sensor is in no file: the load is at the end-effector.
+        tip_rotation = np.asarray(robot.tip_rotation)
+        centre_of_mass = (centre_of_mass - robot.tip_offset) @ tip_rotation
+        inertia = tip_rotation.T @ inertia @ tip_rotation
+    centre = [f"{value:.6g}" for value in centre_of_mass]
+    lines = [
         "[robot.tool]",
         # A text of JSON is one of TOML.
         f"body = {json.dumps(joint, ensure_ascii=False)}",
         f"mass = {payload.mass:.6g}",
         f"centre_of_mass = [{', '.join(centre)}]",
-        f"inertia = {{ {', '.join(entries)} }}",
     ]
+    if payload.sensor is not None:
+        del lines[1]
+    if payload.has_inertia:
+        entries = []
+        for i, j in zip(*np.triu_indices(3), strict=True):
+            entries.append(f"{'xyz'[i]}{'xyz'[j]} = {inertia[i, j]:.6g}")
+        lines.append(f"inertia = {{ {', '.join(entries)} }}")
+    return lines
 
 
 def gains_answer(

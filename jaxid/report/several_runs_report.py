@@ -5,13 +5,14 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from jaxid.identification.fit_result import Fit
 from jaxid.identification.parameter_changes import LEVEL
 from jaxid.io import FilePath
 from jaxid.result_table import Remark, Status, Summarised, Table
 
 from .figure import Figure
 from .page import Section, Settings, code, folded, provenance, render_page, tiles
-from .result_files import write_page_and_table
+from .result_files import MODEL, write_page_and_table
 from .result_records import Record, verdict_rows
 
 
@@ -41,6 +42,7 @@ class RunsReport(Summarised):
         details: Tables beside that of the result.
         glance: Tables of the overview, if it is not that of the result.
         settings: Origin of the result, as `provenance` takes it.
+        model: Fit whose model file is written too, or None.
     """
 
     kind: str
@@ -53,6 +55,7 @@ class RunsReport(Summarised):
     details: Sequence[Table] = ()
     glance: Sequence[Table] = ()
     settings: Settings = dataclasses.field(default_factory=dict)
+    model: Fit | None = None
 
     @property
     def verdict(self) -> Remark:
@@ -77,7 +80,10 @@ class RunsReport(Summarised):
         return [findings, *(self.glance or [self.result.summary()])]
 
     def save(self, folder: FilePath) -> list[Path]:
-        """Write a page, and the numbers as JSON and CSV; return the files."""
+        """Write a page, and the numbers as JSON and CSV; return the files.
+
+        With a model its file too.
+        """
         paths = {run: list(map(str, logs)) for run, logs in self.sources.items()}
         record = {
             "sources": paths,
@@ -111,6 +117,9 @@ class RunsReport(Summarised):
             text = code("\n".join(self.answer.experiment_lines))
             sections.insert(1, ("For the experiment file", [text]))
         page = render_page(self.answer.title, sections)
-        return write_page_and_table(
+        files = write_page_and_table(
             Path(folder), self.kind, page, record, self.estimates
         )
+        if self.model is None:
+            return files
+        return [*files, self.model.save(Path(folder) / MODEL)]

@@ -1,6 +1,7 @@
 """The work of the commands as functions: from logs to a report, with one setup."""
 
 from .excitation_settings import Excitation as Excitation, Leads as Leads
+from .force_sensor_payload import ForceSensor as ForceSensor
 from .geometry_calibration import (
     CalibrationSettings as CalibrationSettings,
     calibrate_from_files as calibrate_from_files,

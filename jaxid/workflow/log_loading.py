@@ -75,10 +75,11 @@ def read_log(setup: Setup, log: FilePath, columns: Columns) -> Recording:
 
 def require_plausible(recording: Recording, log: Path, robot: Robot) -> None:
     """Reject a recording of another number of joints, or with a wrong unit of time."""
-    if recording.joints != robot.joints:
+    joints = len(robot.driven)
+    if recording.joints != joints:
         raise InputError(
             f"`recording.angles` names {recording.joints} of the columns of "
-            f"`{log.name}`, but `{robot.name}` has {robot.joints} joints: name one "
+            f"`{log.name}`, but `{robot.name}` has {joints} joints: name one "
             "column for each, or choose another robot (`robot.tip`)."
         )
     if recording.sample_time < MIN_SAMPLE_TIME:

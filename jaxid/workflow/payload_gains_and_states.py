@@ -22,6 +22,7 @@ from jaxid.identification.operating_states import identify_states
 from jaxid.identification.payload import (
     CENTRAL_NAMES,
     CENTRAL_UNITS,
+    Payload,
     body_columns,
     identify_payload,
 )
@@ -40,6 +41,7 @@ from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS, Tool
 from jaxid.validation.diagnosis import mistakes_in_logs
 from jaxid.validation.torque_errors import TorqueErrors, torque_errors
 
+from .force_sensor_payload import ForceSensor, payload_of_logs, sensor_logs
 from .log_identification import read_earlier_fit
 from .log_loading import is_report, load_logs, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
@@ -144,6 +146,16 @@ def fit_with_and_without_load(
     progress: Progress,
 ) -> Runs:
     """Fit the runs without and with a load."""
+    groups = separate_groups(unloaded, loaded)
+    return fit_runs(setup, groups, columns, progress)
+
+
+def separate_groups(unloaded: Paths, loaded: Paths) -> dict[str, list[Path]]:
+    """Return the logs without and with a load.
+
+    Raises:
+        InputError: If a log is in both.
+    """
     groups = {
         "unloaded": [Path(log) for log in unloaded],
         "loaded": [Path(log) for log in loaded],
@@ -155,7 +167,7 @@ def fit_with_and_without_load(
             f"`{Path(min(shared_places)).name}` is given both as a log without and as "
             "a log with the load: name it once."
         )
-    return fit_runs(setup, groups, columns, progress)
+    return groups
 
 
 def identify_payload_from_logs(
@@ -166,6 +178,7 @@ def identify_payload_from_logs(
     body: int | None = None,
     mass: float | None = None,
     progress: Progress = ignore_progress,
+    sensor: ForceSensor | None = None,
 ) -> RunsReport:
     """Identify a payload from logs without it and logs with it.
 
@@ -177,23 +190,85 @@ def identify_payload_from_logs(
         body: Joint that moves the payload; the last one by default.
         mass: Mass of the payload, if it is known [kg].
         progress: Callback, called with a stage and its completed fraction (0 to 1).
+        sensor: Force sensor in front of the payload, if there is one: then logs without
+            the payload may be missing, and forces of the joints.
     """
+    if sensor is not None:
+        if body is not None:
+            raise InputError(
+                "`body` (`--body`) must not be given with `[sensor]`: the payload is "
+                "behind the sensor, on the end-effector."
+            )
+        return identify_payload_by_sensor(
+            setup, unloaded, loaded, columns, sensor, mass, progress
+        )
+    if not unloaded:
+        raise InputError(
+            "give a log without the payload, too; or describe a force sensor in "
+            "`[sensor]`, behind which everything is payload."
+        )
     runs = fit_with_and_without_load(setup, unloaded, loaded, columns, progress)
     payload = identify_payload(*runs.fits, body=body, mass=mass)
+    loaded_fit = runs.fits[1]
+    doubts = _as_doubts([*runs.doubts, *runs.gain_doubts])
+    return payload_report(
+        payload, loaded_fit, runs.logs[1], runs.sources, doubts, progress
+    )
+
+
+def identify_payload_by_sensor(
+    setup: Setup,
+    unloaded: Paths,
+    loaded: Paths,
+    columns: Columns,
+    sensor: ForceSensor,
+    mass: float | None,
+    progress: Progress,
+) -> RunsReport:
+    """Identify a payload behind a force sensor, see `identify_payload_from_logs`."""
+    groups = separate_groups(unloaded, loaded)
+    columns = sensor.columns(columns)
+    progress("finding base parameters", 0.0)
+    base = sensor.base(setup, columns.forces is not None)
+    logs = {}
+    remarks = []
+    for name, paths in groups.items():
+        logs[name], findings = sensor_logs(setup, base, paths, columns, progress)
+        # Without a load there is nothing that gravity could tell.
+        remarks += findings if name == "loaded" else []
+    payload, fit = payload_of_logs(
+        base, logs["unloaded"], logs["loaded"], mass, progress
+    )
+    return payload_report(payload, fit, logs["loaded"], groups, remarks, progress)
+
+
+def payload_report(
+    payload: Payload,
+    loaded_fit: Fit,
+    logs: Sequence[Observations],
+    sources: Mapping[str, Sequence[Path]],
+    doubts: Sequence[Remark],
+    progress: Progress,
+) -> RunsReport:
+    """Return the report on a payload: its numbers, and errors on the logs with it."""
+    robot = loaded_fit.base.model.robot
     estimates = estimate_rows(
         INERTIAL_NAMES, INERTIAL_UNITS, payload.parameters, payload.uncertainty
     )
     estimates += estimate_rows(CENTRAL_NAMES, CENTRAL_UNITS, *payload.central)
     content = {key: getattr(payload, key) for key in PAYLOAD_KEYS}
-    content["body"] = setup.robot.body_names[payload.body]
+    content["body"] = robot.body_names[payload.body]
+    if payload.sensor is not None:
+        sensor = payload.sensor
+        estimates += estimate_rows(
+            sensor.names, sensor.units, sensor.values, sensor.uncertainty
+        )
     progress("predicting torques", 0.0)
-    loaded_fit = runs.fits[1]
-    logs = runs.logs[1]
     parameters = payload.base_parameters[1]
     load = body_columns(loaded_fit.base, payload.body) @ payload.parameters
     answer = payload_answer(
         payload,
-        setup.robot,
+        robot,
         errors_of(loaded_fit, parameters - load, logs),
         errors_of(loaded_fit, parameters, logs),
     )
@@ -203,8 +278,9 @@ def identify_payload_from_logs(
         answer,
         estimates,
         content,
-        runs.sources,
-        _as_doubts([*runs.doubts, *runs.gain_doubts]),
+        sources,
+        doubts,
+        model=loaded_fit if payload.sensor is not None else None,
     )
 
 

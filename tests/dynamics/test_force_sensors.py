@@ -188,3 +188,32 @@ def test_refusals(arm):
     both = robot.with_sensor(under_base=True).with_sensor()
     assert both.numbers[-1] == len(both.driven) + 1
     assert dataclasses.replace(both).virtual == both.virtual
+
+
+def test_base_sensor_identifies_the_arm_without_torques(arm, wrenches):
+    """Friction of the joints is no force between arm and ground."""
+    path, model, data = arm
+    rotation = data.site("base").xmat.reshape(3, 3)
+    robot = jid.load_urdf(path, tip="load")
+    robot = robot.with_sensor(rotation, data.site("base").xpos, under_base=True)
+    terms = (jid.RigidBodies(), SensorBias())
+    base = jid.base_parameters(jid.Model(robot, terms))
+    rng = np.random.default_rng(5)
+    motion = np.concatenate([np.zeros((3, 300, 6)), rng.normal(size=(3, 300, 3))], 2)
+    forces = np.zeros((300, 9))
+    bias = np.array([1.0, 2.0, 3.0, 0.1, 0.2, 0.3])
+    for row, (q, qd, qdd) in zip(forces, np.moveaxis(motion, 0, 1), strict=True):
+        data.qpos[:], data.qvel[:], data.qacc[:] = q[6:], qd[6:], qdd[6:]
+        mujoco.mj_inverse(model, data)
+        row[:6] = bias + data.sensordata[6:]
+    mask = np.arange(9) < 6
+    observations = jid.Observations.of(
+        *motion, forces, sample_time=0.01, mask=np.tile(mask, (300, 1))
+    )
+    fit = jid.identify(base, observations)
+    # What is not determined is the bias beside the weight of the base.
+    predicted = fit.predict(
+        Motion(*np.concatenate([np.zeros((3, 12, 6)), wrenches[0]], 2))
+    )
+    np.testing.assert_allclose(predicted[:, 6:], wrenches[1], atol=1e-6)
+    assert not fit.undetermined

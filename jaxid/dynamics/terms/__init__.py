@@ -28,7 +28,7 @@ from .friction import (
     TemperatureScaled as TemperatureScaled,
     ViscousFriction as ViscousFriction,
 )
-from .rigid_bodies import RigidBodies as RigidBodies
+from .rigid_bodies import RigidBodies as RigidBodies, SensorLoad as SensorLoad
 from .term import (
     AbstractTerm as AbstractTerm,
     JointParameter as JointParameter,
@@ -50,6 +50,7 @@ TERMS: dict[str, type[AbstractTerm]] = {
     "coupled_drives": CoupledDrives,
     "springs": LinearSpring,
     "temperature": TemperatureScaled,
+    "sensor_load": SensorLoad,
     "sensor_bias": SensorBias,
     "sensor_rotation": SensorRotation,
 }

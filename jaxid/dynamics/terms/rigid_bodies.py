@@ -34,6 +34,10 @@ class RigidBodies(AbstractTerm):
         """Number of inertial parameters of each body: ten, or seven."""
         return PRINCIPAL_PARAMETERS if self.principal_axes else len(INERTIAL_NAMES)
 
+    def bodies(self, robot: Robot) -> tuple[int, ...]:
+        """Return the indices of the bodies whose parameters are unknown."""
+        return robot.solid_bodies
+
     @property
     def meanings(self):
         """Meanings of the ten parameters of a body."""
@@ -54,7 +58,7 @@ class RigidBodies(AbstractTerm):
         """Return `m1`, `mx1`, … `F1`, then those of the next body."""
         pairs = zip(INERTIAL_NAMES, INERTIAL_UNITS, strict=True)
         body_pairs = list(pairs)[: self.body_parameters]
-        numbers = [robot.numbers[body] for body in robot.solid_bodies]
+        numbers = [robot.numbers[body] for body in self.bodies(robot)]
         return tuple((f"{name}{i}", unit) for i in numbers for name, unit in body_pairs)
 
     def columns(self, robot, q, qd, qdd):
@@ -65,12 +69,12 @@ class RigidBodies(AbstractTerm):
     def _as_columns(self, robot: Robot, theta: AnyArray) -> AnyArray:
         """Return the columns of bodies that have a mass, side by side."""
         if robot.virtual:
-            theta = theta[:, np.array(robot.solid_bodies)]
+            theta = theta[:, np.array(self.bodies(robot))]
         return theta[:, :, : self.body_parameters].reshape(robot.joints, -1)
 
     def inertial_parameters(self, robot: Robot, p: TermParameters) -> Bodies:
         """Return ten parameters of each body, with zeros where they are left out."""
-        solid_bodies = robot.solid_bodies
+        solid_bodies = self.bodies(robot)
         bodies = p.reshape(len(solid_bodies), self.body_parameters)
         if self.principal_axes:
             missing = len(INERTIAL_NAMES) - PRINCIPAL_PARAMETERS
@@ -97,14 +101,14 @@ class RigidBodies(AbstractTerm):
         )
 
     @property
-    def spatial_form(self) -> "SpatialBodies":
+    def spatial_form(self) -> "RigidBodies":
         """The same bodies by spatial vectors."""
         return SpatialBodies(self.principal_axes)
 
     def potential_columns(self, robot, q):
         """Return the potential energy of masses and first moments."""
         columns = projection_equation.potential_energy_columns(robot, q)
-        columns = columns[np.array(robot.solid_bodies)]
+        columns = columns[np.array(self.bodies(robot))]
         return columns[:, : self.body_parameters].ravel()
 
 
@@ -127,3 +131,19 @@ class SpatialBodies(RigidBodies):
         return spatial_dynamics.spatial_mass_matrix(
             robot, self.inertial_parameters(robot, p), q
         )
+
+
+class SensorLoad(RigidBodies):
+    """The body behind the force sensor at the end-effector, and no other.
+
+    For logs of the wrench alone, which hold nothing of the arm.
+    """
+
+    def bodies(self, robot):
+        """Return the index of the body behind the sensor."""
+        return robot.sensor_bodies[-1:]
+
+    @property
+    def spatial_form(self) -> "SensorLoad":
+        """The term itself."""
+        return self

@@ -266,7 +266,9 @@ def residual_spectra(lines: Sequence[Lines]) -> ResidualSpectra:
     is_passed = (longest_lines.gain > 0.5) & (longest_lines.frequency > 0)
     if not is_passed.any():
         is_passed = longest_lines.gain > 0
-    leverage = longest_lines.leverage / longest_lines.exposure[:, None]
+    # A joint whose force is not measured has no rows.
+    exposure = np.maximum(longest_lines.exposure, 1e-300)
+    leverage = longest_lines.leverage / exposure[:, None]
     remaining_part = np.clip(1.0 - leverage, 0.02, None)
     whitened_power = longest_lines.residual / remaining_part / longest_lines.gain**2
     power = whitened_power[:, is_passed]

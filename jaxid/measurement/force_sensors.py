@@ -1,0 +1,59 @@
+"""Wrenches of force sensors as rows of virtual joints, and torques that are missing."""
+
+import numpy as np
+
+from jaxid.arrays import AnyArray, Numbers
+from jaxid.dynamics.motion import Motion
+from jaxid.errors import InputError
+from jaxid.robot.limits_and_drives import per_joint
+from jaxid.robot.robot import Robot
+
+from .recording import Recording
+from .samples import MotionAndForces
+
+
+def refuse_missing_wrench(recording: Recording, robot: Robot) -> None:
+    """Refuse a recording whose wrenches are not those of the robot's sensors."""
+    wrench = recording.wrench
+    columns = 0 if wrench is None else wrench.shape[1]
+    if columns != len(robot.rigid):
+        raise InputError(
+            f"`wrench` of `{recording.name}` must have {len(robot.rigid)} columns, six "
+            f"for each force sensor of `{robot.name}`, but has {columns}: name the "
+            "columns, or describe the sensor by `robot.with_sensor()`; of the commands "
+            "only `jaxid payload` uses `[sensor]`."
+        )
+
+
+def on_all_joints(
+    robot: Robot, motion: Motion, forces: AnyArray, wrench: AnyArray
+) -> MotionAndForces:
+    """Return motion and forces of all joints, from those of the driven ones.
+
+    Virtual joints do not move; their forces are the wrenches of the sensors.
+    """
+    columns = np.argsort([*robot.driven, *robot.rigid])
+    zeros = np.zeros(wrench.shape)
+
+    def joined(values: AnyArray, virtual_values: AnyArray) -> np.ndarray:
+        return np.hstack([values, virtual_values])[:, columns]
+
+    q, qd, qdd = (joined(x, zeros) for x in (motion.q, motion.qd, motion.qdd))
+    return Motion(q, qd, qdd), joined(forces, wrench)
+
+
+def measured_joints(robot: Robot, recording: Recording) -> np.ndarray:
+    """Return for each joint whether its force is measured."""
+    is_measured = np.ones(robot.joints, bool)
+    is_measured[list(robot.driven)] = recording.forces is not None
+    return is_measured
+
+
+def speeds_of_all_joints(robot: Robot, min_speed: Numbers | None) -> Numbers | None:
+    """Return smallest speeds of rows that count; virtual joints have none."""
+    if min_speed is None or not robot.virtual:
+        return min_speed
+    speeds = np.zeros(robot.joints)
+    driven = list(robot.driven)
+    speeds[driven] = per_joint("min_speed", min_speed, len(driven), 0.0)
+    return speeds

@@ -1,0 +1,156 @@
+"""A payload behind a force sensor, from logs of its wrench, with torques or without."""
+
+import dataclasses
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+
+import numpy as np
+
+from jaxid.dynamics.base import BaseParameters, base_parameters
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import SensorBias, SensorLoad, SensorRotation
+from jaxid.errors import InputError
+from jaxid.identification.fit_result import Fit
+from jaxid.identification.force_sensor import identify_sensor_rotation
+from jaxid.identification.friction_laws import identify_transition_speeds
+from jaxid.identification.identify import identify
+from jaxid.identification.payload import Payload, identify_payload
+from jaxid.measurement.columns import Columns
+from jaxid.measurement.log_columns import Selection
+from jaxid.measurement.observations import Observations, observe
+from jaxid.result_table import Remark, Status
+from jaxid.robot.rotations import rpy_rotation
+from jaxid.validation.diagnosis import diagnose
+from jaxid.validation.wrench_checks import wrench_remarks
+
+from .log_loading import is_report, read_log
+from .setup import Progress, Setup
+
+PART_TIME = 60.0
+"""Shortest part of a log that may have a bias of its own [s]."""
+MAX_PARTS = 10
+"""Largest number of such parts."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ForceSensor:
+    """Six-axis force sensor at the end-effector, behind which the payload is.
+
+    Attributes:
+        wrench: Columns of three forces [N], then three moments [N m], like
+            `["fx", "fy", "fz", "tx", "ty", "tz"]`.
+        sign: 1 if the force points up at rest, as that of the sensor on the load does;
+            -1 if it points down, as most drivers have it.
+        rotation: Roll, pitch and yaw of the sensor's frame in that of the end-effector
+            [deg], like `[0.0, 0.0, 0.0]`.
+        position: Origin of the sensor's frame there [m], like `[0.0, 0.0, 0.0]`.
+    """
+
+    wrench: Selection
+    sign: float = 1.0
+    rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+
+    def __post_init__(self) -> None:
+        """Refuse other signs.
+
+        Raises:
+            InputError: If the sign is neither 1 nor -1.
+        """
+        if abs(self.sign) != 1:
+            raise InputError(f"`sign` must be 1 or -1, but is {self.sign:g}.")
+
+    def columns(self, columns: Columns) -> Columns:
+        """Return the columns of logs, with those of the wrench."""
+        return dataclasses.replace(columns, wrench=self.wrench, wrench_sign=self.sign)
+
+    def base(self, setup: Setup, has_forces: bool) -> BaseParameters:
+        """Return the base parameters of the robot with the sensor.
+
+        Logs without forces of the joints tell of what is behind the sensor only.
+        """
+        rotation = rpy_rotation(np.deg2rad(self.rotation))
+        robot = setup.robot.with_sensor(rotation, self.position)
+        bodies = setup.model.terms if has_forces else (SensorLoad(),)
+        return base_parameters(Model(robot, (*bodies, SensorBias(), SensorRotation())))
+
+
+def sensor_logs(
+    setup: Setup,
+    base: BaseParameters,
+    paths: Sequence[Path],
+    columns: Columns,
+    progress: Progress,
+) -> tuple[list[Observations], list[Remark]]:
+    """Return logs with a wrench, and what is wrong with them.
+
+    Raises:
+        InputError: If an earlier report is given, which holds no wrench.
+    """
+    robot = base.model.robot
+    logs = []
+    remarks = []
+    for path in paths:
+        if is_report(path):
+            raise InputError(
+                f"`{path.name}` is a report, which holds no wrench: give its log."
+            )
+        progress(f"reading {path.name}", 0.0)
+        recording = read_log(setup, path, columns)
+        log = observe(recording, robot, setup.filter, setup.decimation, setup.min_speed)
+        logs.append(log)
+        remarks += [
+            dataclasses.replace(x, text=f"{recording.name}: {x.text}")
+            for x in wrench_remarks(robot, log)
+        ]
+        if recording.forces is not None:
+            of_joints = dataclasses.replace(recording, wrench=None)
+            diagnosis = diagnose(of_joints, setup.robot, min_speed=setup.min_speed)
+            texts = [f"{recording.name}: {text}" for text in diagnosis.findings]
+            remarks += [Remark(text, Status.DOUBTFUL) for text in texts]
+    return logs, remarks
+
+
+def parts_of(log: Observations) -> list[Observations]:
+    """Return parts of a log in time, each long enough for a bias of its own."""
+    count = int(min(MAX_PARTS, log.duration // PART_TIME))
+    if count < 2:
+        return [log]
+    edges = np.linspace(0, log.rows, count + 1).round()
+    part_of_row = np.searchsorted(edges, np.arange(log.rows), side="right") - 1
+    parts = []
+    for part in range(count):
+        mask = np.asarray(log.mask) & (part_of_row == part)[:, None]
+        parts.append(log.replace(mask=mask, name=f"{log.name}, part {part + 1}"))
+    return parts
+
+
+def payload_of_logs(
+    base: BaseParameters,
+    unloaded: Sequence[Observations],
+    loaded: Sequence[Observations],
+    mass: float | None,
+    progress: Progress,
+) -> tuple[Payload, Fit]:
+    """Return the payload behind the sensor, and the last fit with it.
+
+    Each part of long logs has a bias of its own if they differ by more than chance.
+    """
+    progress("turning the sensor", 0.0)
+    base = identify_transition_speeds(base, loaded)
+    base = identify_sensor_rotation(base, loaded)
+    stage = partial(progress, "identifying the payload")
+    empty_fit = None
+    if unloaded:
+        empty_base = identify_sensor_rotation(base, unloaded, turns=False)
+        empty_fit = identify(empty_base, unloaded, progress=stage, name="unloaded")
+    fit = identify(base, loaded, progress=stage, name="loaded")
+    payload = identify_payload(empty_fit, fit, mass=mass)
+    parts = [part for log in loaded for part in parts_of(log)]
+    if len(parts) > 1:
+        fits = [identify(base, part) for part in parts]
+        by_parts = identify_payload(empty_fit, fits, mass=mass)
+        if by_parts.has_drifting_bias:
+            return by_parts, fits[-1]
+    return payload, fit
