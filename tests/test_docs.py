@@ -20,6 +20,7 @@ import pinocchio as pin
 import polars as pl
 import pytest
 from closed_chains import MECHANISMS
+from true_arm import TrueArm, ball_sessions, true_origins
 
 import jaxid as jid
 from jaxid.cli import app as cli
@@ -218,7 +219,18 @@ def given(tmp_path_factory):
     wrench = load.inverse_dynamics(bodies[1], *motion, motion[1])[:, 2:]
     names |= {"wrench": wrench + np.random.default_rng(9).normal(size=wrench.shape)}
     names |= {"deviations": np.array([0.0, 1e-3])[:, None, None] * np.ones((2, 3))}
+    names["socket_poses"] = _socket_poses()
     return folder, {**names, "fit": jid.identify(base, observations)}
+
+
+def _socket_poses() -> dict[str, list[np.ndarray]]:
+    """Joint coordinates of a Panda whose ball was in two sockets, by session."""
+    panda = jid.robots.panda()
+    poses: dict[str, list[np.ndarray]] = {}
+    for x in ball_sessions(panda, TrueArm(panda, true_origins(panda)), 3, 10):
+        if x.has_poses:
+            poses.setdefault(x.session, []).append(x.q)
+    return poses
 
 
 @pytest.mark.parametrize("page", _with("python"))

@@ -14,3 +14,7 @@ from .observations import (
     PointContact as PointContact,
     SocketDistance as SocketDistance,
 )
+from .pose_proposals import (
+    ProposedSession as ProposedSession,
+    propose_sessions as propose_sessions,
+)

@@ -234,6 +234,24 @@ def test_held_out_errors_are_larger_than_those_of_the_fit(fit):
     assert "held out" in text
 
 
+def test_proposed_sessions_can_be_recorded_and_pay_less_and_less(fit, robot):
+    """Poses are within the limits, and leave the tool at one point."""
+    proposals = c.propose_sessions(
+        fit, c.PointContact, sessions=3, poses=12, candidates=8
+    )
+    tool = fit.frames["", "tool"].position
+    calibrated = TrueArm(fit.robot)
+    for session in proposals:
+        assert len(session.q) >= 6
+        assert (session.q <= robot.limits.position_max).all()
+        assert (session.q >= robot.limits.position_min).all()
+        points = calibrated.placements(session.q, tool)[1]
+        assert np.ptp(points, axis=0).max() < 1e-5
+        assert np.ptp(session.q, axis=0).max() > 0.3
+    narrowings = [session.narrowing for session in proposals]
+    assert 0 < narrowings[-1] <= narrowings[0] < 1
+
+
 def test_real_iiwa(shared_data):
     """Three places of the tool, each held out: the published arm falls to 0.15 mm."""
     robot = jid.load_urdf(shared_data / "mukca" / "iiwa14.urdf")
