@@ -147,7 +147,7 @@ print(slow_fit)
 # * Parameters that a log determines only in combination are reported in combination.
 # * `jid.export.export_servo_mjcf` writes the robot for MuJoCo, with as many draws from the estimates' distribution as you wish.
 #
-# The guide: [my robot logs no torque](../docs/rollout.md).
+# The guide: [my robot logs no torque](../docs/rollout.md). Next: [a force sensor](11_force_sensor.ipynb).
 #
 # ## Exercise
 #

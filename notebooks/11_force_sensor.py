@@ -7,12 +7,8 @@
 # %%
 # %matplotlib inline
 # %config InlineBackend.print_figure_kwargs = {"dpi": 80, "bbox_inches": None}
-import tempfile
-from pathlib import Path
-
 import jax
 import matplotlib.pyplot as plt
-import mujoco
 import numpy as np
 
 import jaxid as jid
@@ -28,6 +24,11 @@ plt.style.use("notebook.mplstyle")
 # reports what the arm exerts on the load: at rest the force points up. Most drivers report the opposite.
 
 # %%
+import tempfile
+from pathlib import Path
+
+import mujoco
+
 XML = """<mujoco><compiler angle="radian"/><worldbody>
 <body name="a" pos="0 0 0.3"><joint name="a" axis="0 0 1"/><inertial pos="0 0 0.1" mass="3" diaginertia="0.1 0.1 0.1"/>
 <body name="b" pos="0 0 0.2"><joint name="b" axis="0 1 0"/><inertial pos="0 0 0.2" mass="2" diaginertia="0.1 0.1 0.1"/>
@@ -96,6 +97,13 @@ plain = jid.identify_payload(None, jid.identify(plain_base, observations))
 centre = np.array([0.012, -0.02, 0.09])
 for name, found in (("rotation estimated", payload), ("rotation ignored", plain)):
     print(f"{name}: errors of the centre {1e3 * (found.centre_of_mass - centre)} mm")
+
+figure, axes = plt.subplots(figsize=(11, 2.6))
+for name, found in (("rotation estimated", payload), ("rotation ignored", plain)):
+    axes.plot(["x", "y", "z"], 1e3 * (found.centre_of_mass - centre), "o", label=name)
+axes.set_ylabel("error of the centre [mm]")
+axes.legend()
+plt.show()
 
 # %% [markdown]
 # ## What you learned

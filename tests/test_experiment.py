@@ -578,7 +578,9 @@ def test_an_mjcf_file_gives_template_robot_and_nominal_values(tmp_path):
 def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
     (tmp_path / "arm.urdf").write_text(URDF)
     text = write_template(tmp_path / "arm.urdf", folder=tmp_path)
-    text = re.sub(r"^# (?=\[(robot.tool|load|collision)\])", "", text, flags=re.M)
+    text = re.sub(
+        r"^# (?=\[(robot.tool|load|sensor|collision)\])", "", text, flags=re.M
+    )
     keys = dict.fromkeys(re.findall(r"^# (\w+) = ", text, flags=re.M))
     assert len(keys) > 25
     for key in set(keys) - {"kind", "coulomb"}:  # the second is a table as well

@@ -219,8 +219,14 @@ class Sides:
         }
 
 
-SIDES = ("angles_on_motor_side", "forces_on_motor_side", "joint_names")
-"""Arguments of `Columns` that `side`, `forces_side` and the robot tell."""
+SIDES = (
+    "angles_on_motor_side",
+    "forces_on_motor_side",
+    "joint_names",
+    "wrench",
+    "wrench_sign",
+)
+"""Arguments of `Columns` that `side`, `forces_side`, robot and `[sensor]` tell."""
 
 
 def build_columns(

@@ -63,6 +63,8 @@ INNER_TABLES = {
     "model": ("model.coulomb", DryFriction),
 }
 """Tables within others, and their functions."""
+INACTIVE_TABLES = ("load", "sensor", "collision", "robot.tool")
+"""Tables that are commented out as a whole."""
 LIMITS = (
     "position_min",
     "position_max",
@@ -130,7 +132,7 @@ def _table(
     name: str, functions: tuple[Callable, ...], joints: int, values: Mapping[str, Any]
 ) -> str:
     """Return a table with all keys of some functions, some or all commented out."""
-    is_active_table = name not in ("load", "collision", "robot.tool")
+    is_active_table = name not in INACTIVE_TABLES
     lines = _comment(SUMMARIES.get(name) or _summary(functions[0]))
     lines.append(f"{'' if is_active_table else '# '}[{name}]")
     if name == "filter":

@@ -26,6 +26,7 @@ from jaxid.dynamics.terms import (
     RigidBodies,
     RotorInertia,
     SensorBias,
+    SensorLoad,
     SensorRotation,
     SquareRootFriction,
     StribeckFriction,
@@ -147,8 +148,8 @@ def test_the_contract_covers_every_term():
         for _, c in inspect.getmembers(terms, inspect.isclass)
         if issubclass(c, AbstractTerm) and not inspect.isabstract(c)
     }
-    # The laws of these two need a robot with a sensor: `test_force_sensors`.
-    of_sensors = {SensorBias, SensorRotation}
+    # The laws of these need a robot with a sensor: `test_force_sensors`.
+    of_sensors = {SensorBias, SensorLoad, SensorRotation}
     assert members - of_sensors == {type(t) for t in ALL}, (
         "add the new term to the list `ALL` of this file"
     )
