@@ -71,6 +71,7 @@ METHODS = (
     Script("friction", 60),
     Script("states", 5),
     Script("agreement", 10),
+    Script("closed_chains", 5),
     Script("rollout", 55),
     Script("calibration", 6),
     Script("force_sensor", 10),

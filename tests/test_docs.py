@@ -19,7 +19,7 @@ import numpy as np
 import pinocchio as pin
 import polars as pl
 import pytest
-from closed_chains import MECHANISMS
+from mechanisms import MECHANISMS
 from true_arm import TrueArm, ball_sessions, true_origins
 
 import jaxid as jid

@@ -366,11 +366,16 @@ class Model(Hashable):
     def closed(self, q: Coordinates) -> AnyArray:
         """Return coordinates as `check`, but those of all joints where loops move some.
 
+        Where they are given already (`Robot.close`), they are taken as they are.
+
         Raises:
             InputError: If the last axis has another length, or loops do not close.
         """
+        robot = self.robot
+        if robot.loops and np.shape(q)[-1:] == (robot.bodies,):
+            return as_array("q", q)
         q = self.check(q)
-        return self.robot.close(q) if self.robot.loops else q
+        return robot.close(q) if robot.loops else q
 
     def check(self, q: Coordinates) -> ManyJoints:
         """Return coordinates as an array with one number for each joint.

@@ -11,6 +11,7 @@ import numpy as np
 
 from jaxid.arrays import Float
 from jaxid.dynamics.motion import Motion
+from jaxid.robot.joint_coordinates import reachable
 
 from .coefficient_limits import FILLED_FRACTION, Grid, ScaledMotions
 from .criterion_gradient import criterion_at_samples
@@ -31,6 +32,8 @@ MAX_ROUNDS = 20
 """Rounds in which poses are looked for that keep all constraints."""
 POSE_SPREAD = 0.05
 """Standard deviation of poses near good ones, relative to the joints' ranges."""
+ROUNDING = 1e-9
+"""Change of a pose that is no move [rad or m]."""
 MIN_POSE_ROOM = 0.05
 """Relative distance from all constraints that a pose should have, to move about it."""
 MIN_SIZE = 1e-3
@@ -113,7 +116,11 @@ def _excess_at_rest(problem: ExcitationProblem, places: Poses):
     for constraint in problem.constraints:
         values = np.asarray(constraint(problem.robot, standstill))
         excess = np.maximum(excess, values.max(axis=1))
-    return excess
+    # Behind a singular pose closed loops are on another branch.
+    poses = np.asarray(q)
+    moves = np.abs(reachable(problem.robot, poses) - poses)
+    is_behind = moves.max(axis=1) > ROUNDING
+    return np.where(is_behind, np.maximum(excess, 1.0), excess)
 
 
 def _enlarge(problem: ExcitationProblem, draws: Draws) -> ScaledMotions:

@@ -17,6 +17,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, atomic_folder, fill_template
 from jaxid.program import Program, evaluate, trace
 from jaxid.program.c_writer import CWriter
+from jaxid.robot.joint_coordinates import reachable
 from jaxid.robot.robot import Robot
 
 from .feed_forward import other_forces, torques
@@ -232,7 +233,10 @@ def _test_tables(fit: Fit, functions: Sequence[CFunction]) -> dict[str, list]:
     tables = {}
     for name in itertools.chain(*(function.inputs for function in functions)):
         if name not in arrays:
-            arrays[name] = np.round(random.uniform(-2.0, 2.0, shape), 3)
+            values = random.uniform(-2.0, 2.0, shape)
+            if name.startswith("q_") or name == "q":
+                values = reachable(fit.base.model.robot, values)
+            arrays[name] = np.round(values, 3)
             tables[name] = arrays[name].tolist()
     for function in functions:
         arguments = [arrays[name].T for name in function.inputs]

@@ -13,6 +13,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, import_extra, write_text
 from jaxid.robot.follower_joints import Follower
 from jaxid.robot.inertia import BodyParameters, Inertia
+from jaxid.robot.joint_coordinates import with_leader
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import Robot
 
@@ -103,7 +104,10 @@ def mjcf_text(
         elements[i] = body
     actuators.extend(_motor(robot, joint) for joint in range(robot.joints))
     if robot.followers:
-        root.append(E.equality(*(_equality(robot, f) for f in robot.followers)))
+        led_followers = with_leader(robot.followers)
+        root.append(E.equality(*(_equality(robot, f) for f in led_followers)))
+    if robot.loops:
+        _append_loops(root, robot, elements)
     tip = placement_attributes(robot.tip_offset, robot.tip_rotation)
     elements[robot.tip_body].append(E.site(name="tip", **tip))
     return etree.tostring(root, pretty_print=True, encoding="unicode")
@@ -130,6 +134,10 @@ def _joint(robot: Robot, i: int, dynamics: Quantities) -> Any:
     )
     # What belongs to a follower is part of what belongs to its leader.
     if i >= robot.joints:
+        follower = robot.followers[i - robot.joints]
+        ends = np.array([follower.position_min, follower.position_max])
+        if np.isfinite(ends).all():
+            element.set("range", exact_text(ends))
         return element
     for quantity, attribute in ATTRIBUTES.items():
         if quantity in dynamics and dynamics[quantity][i]:
@@ -147,6 +155,24 @@ def _equality(robot: Robot, follower: Follower) -> Any:
         joint2=robot.joint_names[follower.leader],
         polycoef=exact_text((follower.offset, follower.factor, 0.0, 0.0, 0.0)),
     )
+
+
+def _append_loops(root: Any, robot: Robot, elements: dict[int, Any]) -> None:
+    """Write the points of the loops as sites, and the pose in which they close."""
+    equality = root.find("equality")
+    for loop in robot.loops:
+        names = (f"{loop.name} first", f"{loop.name} second")
+        for name, body, point in zip(names, loop.bodies, loop.points, strict=True):
+            site = E.site(name=name, pos=exact_text(point))
+            elements[body].append(site)
+        first_name, second_name = names
+        connect = E.connect(name=loop.name, site1=first_name, site2=second_name)
+        equality.append(connect)
+    # The joints in the order of the file.
+    joints = root.find("worldbody").iter("joint")
+    places = [robot.body_names.index(joint.get("name")) for joint in joints]
+    pose = exact_text(np.asarray(robot.loop_pose)[places])
+    root.append(E.keyframe(E.key(name="closed", qpos=pose)))
 
 
 def _motor(robot: Robot, i: int) -> Any:

@@ -10,6 +10,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.program.sample_methods import in_numpy
 from jaxid.result_table import Column, Table, percent, significant
 from jaxid.robot.collision_geometry import BodyShape
+from jaxid.robot.joint_coordinates import reachable
 from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import Figure
@@ -77,7 +78,10 @@ def _friction_columns(base: BaseParameters, speeds: np.ndarray) -> np.ndarray:
     qd = np.zeros((count + 1, joints, joints))
     qd[:-1, moving_joints, moving_joints] = speeds
     samples = qd.reshape(-1, joints)
-    theta = _steady_columns(base, np.zeros_like(samples), samples)
+    q = reachable(base.model.robot, np.zeros_like(samples))
+    theta = _steady_columns(base, q, samples)
+    # In closed loops a joint that moves alone moves bodies in curves.
+    theta[..., _is_of_body(base)] = 0.0
     blocks = theta.reshape(count + 1, joints, joints, -1)
     columns = blocks[:, moving_joints, moving_joints]
     # At standstill there is gravity only.
@@ -148,16 +152,19 @@ def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
 def gravity_forces(fit: Fit, q: np.ndarray) -> np.ndarray:
     """Return the forces of the drives against gravity at standstill [N m or N]."""
     base = fit.base
-    model = base.model
     # Friction and offsets act at standstill, too, and are no part of gravity.
-    is_of_body = np.concatenate(
-        [
-            np.full(len(term.parameters(model.robot)), bool(term.body_parameters))
-            for term in model.terms
-        ]
-    )
-    p = np.where(is_of_body[list(base.indices)], fit.parameters, 0.0)
+    p = np.where(_is_of_body(base), fit.parameters, 0.0)
     return _steady_columns(base, q, np.zeros_like(q)) @ p
+
+
+def _is_of_body(base: BaseParameters) -> np.ndarray:
+    """Return which base parameters are led by one of a body."""
+    model = base.model
+    is_of_body = [
+        np.full(len(term.parameters(model.robot)), bool(term.body_parameters))
+        for term in model.terms
+    ]
+    return np.concatenate(is_of_body)[list(base.indices)]
 
 
 def _steady_columns(base: BaseParameters, q: np.ndarray, qd: np.ndarray) -> np.ndarray:

@@ -125,9 +125,13 @@ def pose_figure(
         # Each point has the largest value of all samples up to the next point.
         sizes = np.nan_to_num(np.abs(np.asarray(values, np.float64)))
         values = np.maximum.reduceat(sizes, rows, axis=0)
-        # A follower's link has the colour of its leader's.
-        leaders = [follower.leader for follower in robot.followers]
-        values = np.concatenate([values, values[:, leaders]], axis=1)
+        # A follower's link has the colour of its leader's; all joints move the loops.
+        largest = values.max(axis=1, keepdims=True)
+        columns = [values]
+        for follower in robot.followers:
+            leader = follower.leader
+            columns.append(largest if leader is None else values[:, [leader]])
+        values = np.concatenate(columns, axis=1)
     points = _points(robot, q[rows])
     solid_clouds = list(clouds)
     if shapes is not None:

@@ -13,6 +13,7 @@ from jaxid.arrays import AnyArray, Array, Float, Hashable, Joints, double_precis
 from jaxid.errors import InputError
 
 from .forward_kinematics import placements
+from .joint_coordinates import reachable
 from .limits_and_drives import complete_limits
 from .robot import Robot
 from .shapes import GROUND, Box, Capsule, HalfSpace, segment_distance
@@ -253,7 +254,7 @@ class CollisionModel(Hashable):
             return self._gaps(self.ends(robot, pose))
 
         with double_precision():
-            gaps_of_poses = jax.jit(jax.vmap(gaps))(q)
+            gaps_of_poses = jax.jit(jax.vmap(gaps))(reachable(robot, q))
         return np.asarray(gaps_of_poses).max(axis=0).tolist()
 
     def _ordered(self, pairs: Sequence[tuple[int, int]]):

@@ -40,7 +40,7 @@ class Follower(eqx.Module):
     name: str = eqx.field(static=True)
     _: dataclasses.KW_ONLY
     revolute: bool = eqx.field(static=True)
-    leader: int | None = eqx.field(static=True)
+    leader: Any = eqx.field(static=True)
     factor: float = eqx.field(static=True, converter=float, default=1.0)
     offset: float = eqx.field(static=True, converter=float, default=0.0)
     position_min: float = eqx.field(static=True, converter=float, default=-math.inf)

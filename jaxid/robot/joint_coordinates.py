@@ -32,22 +32,22 @@ from jaxid.arrays import (
     namespace,
 )
 from jaxid.errors import InputError
-from jaxid.program.sample_methods import evaluate_samples
+from jaxid.program.sample_methods import in_numpy, on_samples
 
 from .follower_joints import Followers, Loop, chain_to_ground
 from .rotations import rotation_about
 
-APPROACH = 0.8
-"""Factor of the distance from the robot's `loop_pose` in one step towards it."""
-MAX_APPROACHES = 40
-"""Steps in which random coordinates come near enough to this pose."""
-
-
-STEPS = 10
-"""Newton's steps that close the loops, from the robot's `loop_pose`."""
+PARTS_OF_WAY = 24
+"""Points on the way to random coordinates at which it is checked."""
+APPROACH_STEPS = 8
+"""Parts of the motors' way from the robot's `loop_pose`, with one Newton step each."""
+THOROUGH_STEPS = 24
+"""The same for samples whose loops do not close by these."""
+NEWTON_STEPS = 6
+"""Newton's steps behind this way."""
 MAX_CHANGE = 0.5
 """Largest change of a joint in one of these steps [rad or m]."""
-MAX_GAP = {"float64": 1e-9, "float32": 1e-4}
+MAX_GAP = {"float64": 1e-12, "float32": 1e-4}
 """Distance between two points of a loop up to which it is closed, by precision [m]."""
 MIN_CLOSING_SHARE = 1e-4
 """Determinant of closing relative to that of the description; below, it is singular."""
@@ -227,32 +227,44 @@ def _place_on(robot: Any, coordinates: Joints, body: int, point: Vector3, carrie
     return point
 
 
-@jax.custom_jvp
-def closed_coordinates(robot: Any, q: Joints) -> Array:
+@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
+def closed_coordinates(
+    robot: Any, q: Joints, approach_steps: int = APPROACH_STEPS
+) -> Array:
     """Return the coordinates of all joints, at which the loops are closed.
 
-    Where no loops close, or on another branch, they are not: see `loop_closure`.
+    The motors go to their coordinates in equal parts, and the loops follow: so they
+    stay on their branch. Where no loops close, they are open: see `loop_closure`.
     """
-    other_coordinates = linear_coordinates(robot.followers, q)
     joints = len(robot.loop_rows)
-    start = jnp.asarray(robot.loop_pose[-joints:], q.dtype)
+    pose = jnp.asarray(robot.loop_pose, q.dtype)
+    start = pose[: robot.joints]
+    change = q - start
+    if robot.bodies == robot.joints + joints:
+        # A full turn of a motor changes nothing, if no joint follows it by a ratio.
+        turn = jnp.arctan2(jnp.sin(change), jnp.cos(change))
+        change = jnp.where(np.array(robot.revolute), turn, change)
 
-    def step(_, loop_coordinates):
+    def step(k, loop_coordinates):
+        share = jnp.minimum((k + 1) / approach_steps, 1.0)
+        other_coordinates = linear_coordinates(robot.followers, start + share * change)
         coordinates = jnp.concatenate([other_coordinates, loop_coordinates])
         _, slopes = gap_slopes(robot, coordinates)
-        change = solve_columns(slopes, -closing_rows(robot, coordinates))
-        change = jnp.minimum(jnp.maximum(change, -MAX_CHANGE), MAX_CHANGE)
-        return loop_coordinates + change
+        newton_step = solve_columns(slopes, -closing_rows(robot, coordinates))
+        newton_step = jnp.minimum(jnp.maximum(newton_step, -MAX_CHANGE), MAX_CHANGE)
+        return loop_coordinates + newton_step
 
-    loop_coordinates = jax.lax.fori_loop(0, STEPS, step, start)
+    steps = approach_steps + NEWTON_STEPS
+    loop_coordinates = jax.lax.fori_loop(0, steps, step, pose[-joints:])
+    other_coordinates = linear_coordinates(robot.followers, q)
     return jnp.concatenate([other_coordinates, loop_coordinates])
 
 
 @closed_coordinates.defjvp
-def _closed_rates(primals: tuple, tangents: tuple):
+def _closed_rates(approach_steps: int, primals: tuple, tangents: tuple):
     """Return the coordinates and their rates, by the implicit function theorem."""
     robot, _ = primals
-    coordinates = closed_coordinates(*primals)
+    coordinates = closed_coordinates(*primals, approach_steps)
     joints = len(robot.loop_rows)
     loop_coordinates = coordinates[-joints:]
 
@@ -274,12 +286,10 @@ def solve_columns(A: Array, b: Array) -> Array:
     """
     n = len(A)
     columns = [A[:, j] for j in range(n)]
-    squares = []
     products = {}
     solution = []
     for i in range(n):
         square = columns[i] @ columns[i] + SMALLEST_SQUARE
-        squares.append(square)
         for j in range(i + 1, n):
             products[i, j] = columns[i] @ columns[j] / square
             columns[j] = columns[j] - products[i, j] * columns[i]
@@ -315,9 +325,9 @@ def determinant(A: Array) -> Array:
 def loop_closure(robot: Any, coordinates: Joints) -> Array:
     """Return the square of the distance by which loops are open [m²], and a share.
 
-    The share is the determinant of the slopes by the joints that loops move,
-    relative to that at the robot's `loop_pose`: zero where the loops are singular,
-    negative on another branch.
+    The share is the determinant of the slopes by the joints that loops move, relative
+    to that at the robot's `loop_pose`: zero where the loops are singular, negative on
+    another branch.
     """
     gaps = loop_gaps(robot, coordinates)
     _, slopes = gap_slopes(robot, coordinates)
@@ -331,15 +341,20 @@ class Closure(eqx.Module):
     """Closing of the loops of a robot."""
 
     robot: Any
+    approach_steps: int = eqx.field(static=True, default=APPROACH_STEPS)
 
     def of_sample(self, q: Joints) -> Array:
         """Return the coordinates of all joints of one sample, and `loop_closure`."""
-        coordinates = closed_coordinates(self.robot, q)
-        return jnp.concatenate([coordinates, loop_closure(self.robot, coordinates)])
+        robot = self.robot
+        coordinates = closed_coordinates(robot, q, self.approach_steps)
+        return jnp.concatenate([coordinates, loop_closure(robot, coordinates)])
 
     def of_samples(self, q: ManyJoints) -> AnyArray:
-        """Return the same of many samples."""
-        return evaluate_samples(self, self.of_sample, q)
+        """Return the same of many samples; in float64 for NumPy's arrays."""
+        if not isinstance(q, np.ndarray):
+            return on_samples(self, self.of_sample, q)
+        rows = in_numpy(self, self.of_sample, q.reshape(-1, self.robot.joints))
+        return rows.reshape(*q.shape[:-1], -1)
 
 
 def close_loops(robot: Any, q: Numbers) -> ManyJoints:
@@ -353,21 +368,33 @@ def close_loops(robot: Any, q: Numbers) -> ManyJoints:
     if not robot.loops:
         return linear_coordinates(robot.followers, q)
     closure = Closure(robot).of_samples(q)
+    is_closed = _is_closed(closure)
+    if isinstance(closure, np.ndarray) and not is_closed.all():
+        thorough_closing = Closure(robot, THOROUGH_STEPS)
+        closure[~is_closed] = thorough_closing.of_samples(q[~is_closed])
+        is_closed = _is_closed(closure)
     coordinates = closure[..., : robot.bodies]
-    squares = closure[..., robot.bodies]
-    max_gap = MAX_GAP[closure.dtype.name]
-    is_closed = (squares <= max_gap**2) & (closure[..., -1] > MIN_CLOSING_SHARE)
     if is_traced(closure):
         return jnp.where(is_closed[..., None], coordinates, jnp.nan)
     if not np.all(is_closed):
         sample = int(np.argmin(np.ravel(is_closed)))
         pose = np.asarray(q).reshape(-1, robot.joints)[sample]
-        raise _open_error(robot, sample, pose, np.sqrt(np.ravel(squares)[sample]))
+        raise _open_error(
+            robot, sample, pose, float(np.sqrt(closure[..., -2].ravel()[sample]))
+        )
     return coordinates
 
 
-def reachable(robot: Any, q: ManyJoints) -> ManyJoints:
-    """Return coordinates, moved towards `loop_pose` until loops close there safely.
+def _is_closed(closure: AnyArray, min_share: float = MIN_CLOSING_SHARE):
+    """Return whether loops close, on the branch of the description."""
+    max_gap = MAX_GAP[closure.dtype.name]
+    return (closure[..., -2] <= max_gap**2) & (closure[..., -1] > min_share)
+
+
+def reachable(robot: Any, q: np.ndarray) -> np.ndarray:
+    """Return the last coordinates on the way from `loop_pose` that loops reach safely.
+
+    They do not pass a singular pose, behind which a loop may close in two ways.
 
     Args:
         robot: Robot, which may have no loops.
@@ -375,16 +402,16 @@ def reachable(robot: Any, q: ManyJoints) -> ManyJoints:
     """
     if not robot.loops:
         return q
-    middle = np.asarray(robot.loop_pose)[: robot.joints]
-    q = np.array(q, np.float64)
-    for _ in range(MAX_APPROACHES):
-        closure = Closure(robot).of_samples(q)
-        is_open = closure[..., robot.bodies] > MAX_GAP[closure.dtype.name] ** 2
-        is_open |= ~(closure[..., -1] > MIN_SAFE_SHARE)
-        if not is_open.any():
-            break
-        q[is_open] = middle + APPROACH * (q[is_open] - middle)
-    return q
+    start = np.asarray(robot.loop_pose)[: robot.joints]
+    way = np.asarray(q, np.float64) - start
+    shares = np.zeros(way.shape[:-1])
+    for part in range(1, PARTS_OF_WAY + 1):
+        share = part / PARTS_OF_WAY
+        closure = Closure(robot).of_samples(start + share * way)
+        is_safe = _is_closed(closure, MIN_SAFE_SHARE)
+        is_reached = shares == (part - 1) / PARTS_OF_WAY
+        shares[is_safe & is_reached] = share
+    return start + shares[..., None] * way
 
 
 def _open_error(robot: Any, sample: int, pose: np.ndarray, distance: float):

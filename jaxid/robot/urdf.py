@@ -11,7 +11,7 @@ from jaxid.errors import InputError
 
 from .follower_joints import Followers
 from .inertia import IMPOSSIBLE, MAX_DENSITY, ball_densities
-from .joint_coordinates import linear_coordinates, linear_ratios
+from .joint_coordinates import linear_coordinates, linear_ratios, with_leader
 from .limits_and_drives import (
     MAX_STATED_ANGLE,
     MAX_STATED_LENGTH,
@@ -138,7 +138,7 @@ def load_urdf(
         if not tree.loops:
             return robot
         names = robot.body_names
-        poses = [np.array([pose[x] for x in names]) for pose in tree.poses]
+        poses = [np.array([pose.get(x, 0.0) for x in names]) for pose in tree.poses]
         return assembled(robot, poses)
     except InputError as error:
         raise InputError(f"`{path}`: {error}") from error
@@ -220,6 +220,9 @@ def _leading_joints(tree: UrdfTree) -> list[Any]:
 def _of_leaders(followers: Followers, parameters: dict[str, Any]) -> dict[str, Any]:
     """Return parameters of all joints as those of the joints that move alone."""
     joints = len(parameters["armature"]) - len(followers)
+    # No parameter describes those of joints that loops move.
+    described = joints + len(with_leader(followers))
+    parameters = {key: values[:described] for key, values in parameters.items()}
     # What is negative is not used.
     for key in ("armature", "damping", "friction", "stiffness"):
         parameters[key] = np.maximum(parameters[key], 0.0)
@@ -383,8 +386,8 @@ def _follower_notes(tree: UrdfTree):
     for number, follower in enumerate(tree.followers, first_number):
         if follower.leader is None:
             yield (
-                f"joint `{follower.name}`: closed loops move it, as its motors "
-                f"stand; its body has the number {number} (`m{number}`)."
+                f"joint `{follower.name}`: closed loops move it with the "
+                f"motors; its body has the number {number} (`m{number}`)."
             )
             continue
         leader_name = tree.joints[follower.leader].get("name")

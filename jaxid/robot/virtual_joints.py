@@ -110,6 +110,11 @@ def with_group(
     def inserted(values: Any, group: Any) -> Any:
         return [*values[:start], *group, *values[start:]]
 
+    if robot.loops:
+        raise InputError(
+            f"`{robot.name}` has closed loops: sensors and bases on them are not "
+            "described."
+        )
     # What stood on the ground stands on the base.
     parents = [moved(body) for body in robot.parent]
     if carrier < 0:

@@ -12,6 +12,7 @@ from jaxid.errors import InputError
 from jaxid.excitation.constraints import ForceLimits
 from jaxid.report.result_files import read_fit
 from jaxid.robot.inertia import IMPOSSIBLE
+from jaxid.robot.joint_coordinates import reachable
 from jaxid.robot.limits_and_drives import complete_limits
 from jaxid.robot.robot import Robot
 
@@ -137,4 +138,4 @@ def random_poses(robot: Robot) -> np.ndarray:
     high = np.asarray(limits.position_max)
     poses = np.random.default_rng(0).uniform(low, high, (RANDOM_POSES, robot.joints))
     poses[0] = np.clip(0.0, low, high)
-    return poses
+    return reachable(robot, poses)

@@ -4,10 +4,11 @@ import jax
 import mujoco
 import numpy as np
 import pytest
-from closed_chains import MECHANISMS, mjcf, projection
+from mechanisms import MECHANISMS, mjcf, projection
 
 import jaxid as jid
 from jaxid.errors import InputError
+from jaxid.export.mujoco_model import mjcf_text
 from jaxid.robot.loop_assembly import with_loops
 from jaxid.robot.urdf import urdf_parameters
 
@@ -166,3 +167,36 @@ def test_files_whose_loops_do_not_close_are_one_sentence(tmp_path):
     path.write_text(mjcf(mechanism, mechanism.pose, motors=("a1",)))
     with pytest.raises(InputError, match=r"have 2 freedom.* but 1 motor.* at `a1`"):
         jid.load_mjcf(path)
+
+
+@pytest.mark.parametrize("mechanism", [MECHANISMS["palletiser"]])
+def test_a_written_mjcf_file_closes_the_same_loops(path):
+    robot, bodies = jid.load_mjcf(path), urdf_parameters(path)
+    text = mjcf_text(robot, bodies.reshape(-1, 10), {})
+    path.write_text(text)
+    again = jid.load_mjcf(path)
+    assert again.body_names == robot.body_names
+    np.testing.assert_allclose(urdf_parameters(path), bodies, atol=1e-9)
+    q = np.array([0.2, 1.3, 0.2])
+    np.testing.assert_allclose(again.close(q), robot.close(q), atol=1e-9)
+
+
+@pytest.mark.parametrize("mechanism", [MECHANISMS["slider"]])
+def test_designs_keep_away_from_singular_poses_and_limits_of_passive_joints(path):
+    text = path.read_text().replace('type="slide"', 'type="slide" range="-.2 .4"')
+    path.write_text(text)
+    robot = jid.load_mjcf(path)
+    limits = jid.constraints.LoopLimits()
+    # At 1.57 the slide would be beyond its range; at 3.3 the loop is open.
+    q = np.array([[0.9], [2.4], [3.3]])
+    values = limits(robot, jid.Motion(q, 0 * q, 0 * q))
+    names = [entry.name for entry in limits.entries(robot)]
+    assert values.shape == (3, len(names))
+    assert (values[0] <= 0).all()
+    slide = robot.close(q[:2])[:, -1]
+    lower = names.index("joint `slide`, which loops move,")
+    np.testing.assert_allclose(values[:2, lower], (-0.2 - slide) / 0.3, atol=1e-9)
+    problem = jid.ExcitationProblem(
+        jid.base_parameters(jid.Model(robot, (jid.RigidBodies(),))), noise=[1.0]
+    )
+    assert type(problem.constraints[-1]) is jid.constraints.LoopLimits

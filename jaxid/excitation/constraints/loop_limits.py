@@ -8,10 +8,8 @@ from jaxid.arrays import AnyArray, Joints
 from jaxid.program.sample_methods import evaluate_samples
 from jaxid.robot.joint_coordinates import (
     MIN_SAFE_SHARE,
-    all_coordinates,
+    Closure,
     all_rates,
-    at_sample,
-    loop_closure,
 )
 from jaxid.robot.robot import Robot
 
@@ -39,10 +37,10 @@ class LoopLimits(AbstractConstraint):
 
     def excess(self, robot: Robot, q: Joints, qd: Joints) -> AnyArray:
         """Return the relative excess of one sample over each limit."""
-        robot, q = at_sample(robot, q)
-        coordinates = all_coordinates(robot, q)
-        rates = all_rates(robot, q, qd)
-        square, share = loop_closure(robot, coordinates)
+        closure = Closure(robot).of_sample(q)
+        coordinates = closure[: robot.bodies]
+        square, share = closure[robot.bodies :]
+        rates = all_rates(robot, coordinates, qd)
         values = [square / SIZE**2 - SIZE**2, 1.0 - share / self.min_share]
         for body, joint in _moved_joints(robot):
             coordinate = coordinates[body]

@@ -35,6 +35,23 @@ SLIDER = """
     {slide}<site name="e2" pos="0 0 0"/></body></body>
 """
 
+# Three arms that carry a plate; rods turn about two axes at their elbows.
+DELTA_ARM = """
+<body name="arm{k}" euler="0 0 {angle}"><body name="upper{k}" pos=".2 0 0">
+  <joint name="arm{k}" axis="0 1 0"/>{{upper{k}}}
+  <body name="rod{k}" pos=".25 0 0"><joint name="bend{k}" axis="0 1 0"/>
+    <joint name="swing{k}" axis="0 0 1"/>{{rod{k}}}
+    <site name="e{first}" pos=".5 0 0"/></body></body></body>
+"""
+DELTA_PLATE = """
+<body name="plate"><joint name="x" type="slide" axis="1 0 0"/>
+  <joint name="y" type="slide" axis="0 1 0"/>
+  <joint name="z" type="slide" axis="0 0 1"/>{plate}
+  <site name="e2" pos=".06 0 0"/>
+  <site name="e4" pos="-.03 .0519615242 0"/><site name="e6" pos="-.03 -.0519615242 0"/>
+</body>
+"""
+
 
 class Mechanism(NamedTuple):
     """Bodies, motors, a pose in which the loop nearly closes, spread of motions."""
@@ -73,11 +90,14 @@ def mjcf(mechanism, pose, motors=None):
     bodies = mechanism.bodies.format(**inertials)
     names = mechanism.motors if motors is None else motors
     actuators = "".join(f'<motor joint="{x}" ctrlrange="-80 80"/>' for x in names)
+    pins = "".join(
+        f'<connect name="pin{k or ""}" site1="e{2 * k + 1}" site2="e{2 * k + 2}"/>'
+        for k in range(bodies.count("<site") // 2)
+    )
     text = (
         '<mujoco model="mechanism"><compiler angle="radian"/>'
         f"<worldbody>{bodies}</worldbody>"
-        '<equality><connect name="pin" site1="e1" site2="e2"/></equality>'
-        f"<actuator>{actuators}</actuator>"
+        f"<equality>{pins}</equality><actuator>{actuators}</actuator>"
     )
     model = mujoco.MjModel.from_xml_string(text + "</mujoco>")
     order = [model.joint(k).name for k in range(model.njnt)]
@@ -125,11 +145,11 @@ def projection(model, data, q, motors, qd, qdd):
 
 
 def difference(model, data, jacobian_of):
-    """Difference of the Jacobians of both points."""
-    first, second = np.zeros((2, 3, model.nv))
-    jacobian_of(model, data, first, None, model.site("e1").id)
-    jacobian_of(model, data, second, None, model.site("e2").id)
-    return second - first
+    """Differences of the Jacobians of the points of each pair."""
+    jacobians = np.zeros((model.nsite, 3, model.nv))
+    for number, jacobian in enumerate(jacobians, 1):
+        jacobian_of(model, data, jacobian, None, model.site(f"e{number}").id)
+    return (jacobians[1::2] - jacobians[::2]).reshape(-1, model.nv)
 
 
 MECHANISMS = {
@@ -155,3 +175,20 @@ MECHANISMS = {
         0.6,
     ),
 }
+DELTA = Mechanism(
+    "".join(
+        DELTA_ARM.format(k=k, angle=2 * np.pi / 3 * k, first=2 * k + 1)
+        for k in range(3)
+    )
+    + DELTA_PLATE,
+    (*(f"{kind}{k}" for k in range(3) for kind in ("upper", "rod")), "plate"),
+    ("arm0", "arm1", "arm2"),
+    {
+        **dict.fromkeys(("arm0", "arm1", "arm2"), 0.3),
+        **dict.fromkeys(("bend0", "bend1", "bend2"), 2.13),
+        **dict.fromkeys(("swing0", "swing1", "swing2", "x", "y"), 0.0),
+        "z": -0.4003,
+    },
+    0.25,
+)
+"""A mechanism of more loops, for the benchmark: nothing was set on it."""
