@@ -87,6 +87,12 @@ from .program.jax_compilation_cache import (
     enable_compilation_cache as enable_compilation_cache,
 )
 from .robot import collision as collision, robots as robots
+from .robot.contacts import (
+    Contact as Contact,
+    Imu as Imu,
+    Sole as Sole,
+    Sphere as Sphere,
+)
 from .robot.inertia import Tool as Tool
 from .robot.library import from_dh as from_dh
 from .robot.limits_and_drives import Drives as Drives, Limits as Limits

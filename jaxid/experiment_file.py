@@ -81,6 +81,9 @@ KEYS: dict[str, TomlTable] = {
             "kr300",
             "planar_arm",
         ],
+        "floating": bool,
+        "imu": str,
+        "contacts": dict[str, str | float],
         "name": str,
         "gravity": Vector,
         "base_rotation": Vector,
@@ -127,12 +130,17 @@ KEYS: dict[str, TomlTable] = {
         "angles": Column,
         "forces": Column,
         "velocities": Column,
+        "gyro": Column,
+        "accelerometer": Column,
+        "contact": Column,
         "time": str | int | tuple[str | int, str | int],
         "sample_time": float,
         "time_unit": Unit,
         "angle_unit": Units,
         "velocity_unit": Units,
         "force_unit": Units,
+        "gyro_unit": Unit,
+        "accelerometer_unit": Annotated[float, Bounds(above=0.0)],
         "torque_constants": PerJoint,
         "rated_angles": PerJoint,
         "rated_velocities": PerJoint,
@@ -348,7 +356,7 @@ def _require_robot(table: TomlTable, folder: Path) -> None:
         )
     source = sources[0]
     if source == "builtin":
-        for key in ("tip", "base", "xacro_arguments"):
+        for key in ("tip", "base", "xacro_arguments", "floating", "imu", "contacts"):
             if key in table:
                 raise InputError(
                     f"`{key}` belongs to `urdf`, not to `builtin`: remove it."

@@ -151,8 +151,7 @@ class BaseParameters(Summarised, Hashable):
     @property
     def joint_regressor(self) -> JointRegressor:
         """Base regressor of many samples, joint by joint, for JAX (Eq. 23)."""
-        n = (self.model.robot.joints,)
-        return JointRegressor(self, self.columns, n, n, n)
+        return JointRegressor(self, self.columns, *self.model.input_shapes)
 
     @property
     def acting_columns(self) -> tuple[Columns, ...]:
@@ -180,8 +179,7 @@ class BaseParameters(Summarised, Hashable):
         model = self.model
         if model.robot.tool is None:
             return np.zeros(motion.q.shape)
-        q = model.closed(motion.q)
-        return in_numpy(model, model.known_forces, q, motion.qd, motion.qdd)
+        return in_numpy(model, model.known_forces, *model.arguments(motion))
 
     def regressor(self, motion: Motion) -> AnyArray:
         r"""Return the base regressor $\Theta_B$ [*batch, joints, base] (Eq. 23)."""

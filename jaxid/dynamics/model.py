@@ -23,6 +23,7 @@ from jaxid.arrays import (
 from jaxid.errors import InputError
 from jaxid.program import Program, Shape
 from jaxid.program.sample_methods import on_samples, program_of, spatial_form
+from jaxid.robot.contacts import legs_of
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.joint_coordinates import at_sample
 from jaxid.robot.robot import Robot
@@ -146,8 +147,10 @@ class Model(Hashable):
         robot = self.robot
         standstill = np.zeros(robot.joints)
         law = self.memory
-        states = [] if law is None else [law.settled(standstill).shape]
+        size = 0 if law is None else law.settled(standstill).shape[0]
+        size += legs_of(robot).entries if robot.contacts else 0
         coordinates = robot.bodies if robot.loops else robot.joints
+        states = [(size,)] if size else []
         return [(coordinates,), standstill.shape, standstill.shape, *states]
 
     def with_memory(self, **changes: Any) -> "Model":
@@ -169,35 +172,57 @@ class Model(Hashable):
         return dataclasses.replace(self, terms=terms)
 
     def arguments(self, motion: Motion) -> tuple[AnyArray, ...]:
-        """Return the arguments of `columns`: with the state if friction has memory.
+        """Return the arguments of `columns`: with the state if forces depend on one.
 
-        Where a motion does not have the state, its samples are a path in the order of
-        time.
+        Where a motion does not have the state of friction with memory, its samples are
+        a path in the order of time; without that of contacts, no foot stands.
         """
         q = self.closed(motion.q)
         law = self.memory
         state = motion.state
-        if law is None:
-            return q, motion.qd, motion.qdd
-        if state is None and motion.qd.ndim == 1:
-            state = law.settled(motion.qd)
-        elif state is None:
-            start = law.settled(motion.qd[..., 0, :])
-            state = law.states(motion.q, start)
-        return q, motion.qd, motion.qdd, state
+        if law is not None and state is None:
+            if motion.qd.ndim == 1:
+                state = law.settled(motion.qd)
+            else:
+                start = law.settled(motion.qd[..., 0, :])
+                state = law.states(motion.q, start)
+        contacts = motion.contacts
+        if self.robot.contacts and contacts is None:
+            entries = legs_of(self.robot).entries
+            contacts = np.zeros((*motion.q.shape[:-1], entries))
+        states = [x for x in (state, contacts) if x is not None]
+        if len(states) == 2:
+            states = [namespace(*states).concatenate(states, axis=-1)]
+        return (q, motion.qd, motion.qdd, *states)
 
     def columns(self, q, qd, qdd, s=None) -> AnyArray:
         r"""Return the regressor $\Theta$ of one sample by definition (Eqs. 16, 18)."""
         robot, q = at_sample(self.robot, q)
-        terms = self.terms if s is None else self.with_memory(state=s).terms
-        return jnp.concatenate([t.columns(robot, q, qd, qdd) for t in terms], axis=1)
+        terms = self._in_state(s).terms
+        theta = jnp.concatenate([t.columns(robot, q, qd, qdd) for t in terms], axis=1)
+        return self._without_contacts(theta, s)
 
     def forces(self, p, q, qd, qdd, s=None) -> Joints:
         """Return the generalised forces of one sample by definition (Eqs. 11, 15)."""
         robot, q = at_sample(self.robot, q)
-        model = self if s is None else self.with_memory(state=s)
-        parts = model.split(p)
-        return reduce(add, (t.forces(robot, x, q, qd, qdd) for t, x in parts))
+        parts = self._in_state(s).split(p)
+        forces = reduce(add, (t.forces(robot, x, q, qd, qdd) for t, x in parts))
+        return self._without_contacts(forces, s)
+
+    def _in_state(self, s: AnyArray | None) -> "Model":
+        """Return the model with the state of friction with memory, if it has some."""
+        has_state = s is not None and self.memory is not None
+        return self.with_memory(state=s) if has_state else self
+
+    def _without_contacts(self, rows: Any, s: AnyArray | None) -> AnyArray:
+        """Return rows without the forces of feet that stand (see `contacts`)."""
+        if s is None or not self.robot.contacts:
+            return rows
+        legs = legs_of(self.robot)
+        shape = (len(legs.rows), len(legs.joints))
+        X = s[s.shape[0] - legs.entries :].reshape(shape)
+        base_rows = np.array(legs.rows)
+        return rows.at[base_rows].add(-X @ rows[np.array(legs.joints)])
 
     def inertia(self, p, q) -> JointMatrix:
         """Return the mass matrix of one sample by definition (Eq. 38)."""
@@ -248,7 +273,7 @@ class Model(Hashable):
         """The same model by spatial vectors."""
         return SpatialModel(self.robot, spatial_form(self.terms))
 
-    def known_forces(self, q, qd, qdd) -> Joints:
+    def known_forces(self, q, qd, qdd, s=None) -> Joints:
         """Return the generalised forces of the known tool at one sample [N m or N]."""
         tool = self.robot.tool
         if tool is None:
@@ -256,7 +281,8 @@ class Model(Hashable):
         bodies: list[AnyArray] = [np.zeros(10)] * self.robot.bodies
         bodies[tool.body] = tool.parameters
         p = namespace(tool.parameters).stack(bodies)
-        return projection_equation.rigid_body_forces(self.robot, p, q, qd, qdd)
+        forces = projection_equation.rigid_body_forces(self.robot, p, q, qd, qdd)
+        return self._without_contacts(forces, s)
 
     def regressor(self, motion: Motion) -> AnyArray:
         r"""Return the regressor $\Theta(q, \dot q, \ddot q)$ (Eqs. 16, 18).
@@ -360,8 +386,7 @@ class Model(Hashable):
 
     def tool_forces(self, motion: Motion) -> ManyJoints:
         """Return the forces of the known tool [N m or N]; zero without a tool."""
-        q = self.closed(motion.q)
-        return on_samples(self, self.known_forces, q, motion.qd, motion.qdd)
+        return on_samples(self, self.known_forces, *self.arguments(motion))
 
     def closed(self, q: Coordinates) -> AnyArray:
         """Return coordinates as `check`, but those of all joints where loops move some.

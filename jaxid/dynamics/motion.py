@@ -3,6 +3,7 @@
 from typing import Any
 
 import equinox as eqx
+import jax
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float, ManyJoints, as_array
@@ -24,17 +25,19 @@ class Motion(eqx.Module):
         qd: Velocities [rad/s or m/s].
         qdd: Accelerations [rad/s² or m/s²].
         state: States of friction with memory; None where they follow from the path `q`.
+        contacts: Entries of $X$ of feet that stand (`robot.contacts`), zero for others;
+            None if no foot stands.
     """
 
     q: ManyJoints = eqx.field(converter=_coordinates)
     qd: ManyJoints = eqx.field(converter=_coordinates)
     qdd: ManyJoints = eqx.field(converter=_coordinates)
     state: Float[AnyArray, "*batch states"] | None = None
+    contacts: Float[AnyArray, "*batch entries"] | None = None
 
     def __getitem__(self, index) -> "Motion":
         """Return the motion at some instants, by an index of the leading axis."""
-        state = None if self.state is None else self.state[index]
-        return Motion(self.q[index], self.qd[index], self.qdd[index], state)
+        return jax.tree.map(lambda x: x[index], self)
 
     @property
     def joints(self) -> int:

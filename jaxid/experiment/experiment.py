@@ -18,6 +18,7 @@ from jaxid.measurement.columns import Columns
 from jaxid.measurement.filters import FILTERS
 from jaxid.measurement.log_files import summarise_columns
 from jaxid.robot.inertia import Tool
+from jaxid.robot.virtual_joints import driven_robot, with_driven
 from jaxid.workflow.excitation_settings import Excitation
 from jaxid.workflow.force_sensor_payload import ForceSensor
 from jaxid.workflow.geometry_calibration import CalibrationSettings
@@ -133,10 +134,12 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
     with within("robot"):
         robot_file = source.robot_file(path.parent)
         robot = source.build(robot_file)
-    require_joint_lists(tables, robot)
+    joints = driven_robot(robot)
+    require_joint_lists(tables, joints)
     for name, replace in (("limits", replace_limits), ("drives", replace_drives)):
         if name in tables:
-            robot = call(replace, tables[name], name, robot)
+            joints = call(replace, tables[name], name, joints)
+    robot = with_driven(robot, joints)
     columns = None
     reading = LogReading()
     sensor = None
@@ -144,9 +147,9 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
         sensor = call(ForceSensor, tables["sensor"], "sensor")
     if "recording" in tables:
         columns, reading = build_columns(
-            tables["recording"], robot, path.parent, getattr(sensor, "wrench", None)
+            tables["recording"], joints, path.parent, getattr(sensor, "wrench", None)
         )
-        require_gears(robot, columns)
+        require_gears(joints, columns)
     load = None
     if "load" in tables:
         load_of_robot = call(known_load, tables["load"], "load")

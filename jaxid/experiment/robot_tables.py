@@ -12,6 +12,7 @@ from jaxid.errors import InputError
 from jaxid.experiment_values import PerJoint, TomlTable, Vector
 from jaxid.measurement.columns import Columns
 from jaxid.robot import library
+from jaxid.robot.contacts import AbstractContactShape, Sole, Sphere
 from jaxid.robot.inertia import Tool
 from jaxid.robot.limits_and_drives import Limits, per_joint, range_fault
 from jaxid.robot.robot import Robot
@@ -105,6 +106,14 @@ class RobotSource:
             `{ dof = "6" }`.
         builtin: Name of a robot that jaxid knows, like `"tx40"`: tx90l_on_rail, tx40,
             ur10, ur10e, panda, iiwa14, kr300 or planar_arm.
+        floating: Whether the base of that file moves freely, as that of a robot on
+            legs, like `true`: then `[recording]` names `gyro`, `accelerometer` and
+            `contact`.
+        imu: Link (site) of the IMU on a floating base, like `"imu"`; the frame of the
+            base by default.
+        contacts: Links (bodies) of the feet of a floating base, in the order of
+            `recording.contact`, with the radius of a ball [m] or "sole", like
+            `{ FL_foot = 0.022, FR_foot = 0.022 }`; those of an MJCF file by default.
 
         name: Name of the robot, like `"my robot"`.
         gravity: Gravity in the frame of the ground [m/s²], that of the robot's file by
@@ -123,6 +132,9 @@ class RobotSource:
     base: str | None = None
     xacro_arguments: dict[str, str | bool | int | float] | None = None
     builtin: str | None = None
+    floating: bool | None = None
+    imu: str | None = None
+    contacts: dict[str, float | str] | None = None
 
     name: str | None = None
     gravity: Vector | None = None
@@ -142,7 +154,11 @@ class RobotSource:
             for key, value in (self.xacro_arguments or {}).items()
         }
         chain = {"tip": self.tip, "base": self.base, "xacro_arguments": arguments}
-        return RobotFile(folder / name, **chain, **self.placement)
+        base = {"floating": bool(self.floating), "imu": self.imu}
+        contacts = None if self.contacts is None else _shapes_of(self.contacts)
+        return RobotFile(
+            folder / name, **chain, **self.placement, **base, contacts=contacts
+        )
 
     @property
     def placement(self) -> dict[str, Any]:
@@ -178,6 +194,19 @@ class RobotSource:
         if isinstance(tool, float):
             raise InputError("`robot.tool.centre_of_mass` is missing.")
         return robot if tool is None else robot.replace(tool=tool)
+
+
+def _shapes_of(contacts: dict[str, float | str]) -> dict[str, AbstractContactShape]:
+    """Return the shapes of feet."""
+    shapes: dict[str, AbstractContactShape] = {}
+    for link, value in contacts.items():
+        if isinstance(value, str) and value != "sole":
+            raise InputError(
+                f'`contacts` must hold a radius [m] or "sole", but `{link}` has '
+                f"{value!r}."
+            )
+        shapes[link] = Sole() if isinstance(value, str) else Sphere(value)
+    return shapes
 
 
 def require_joint_lists(tables: TomlTable, robot: Robot) -> None:

@@ -139,10 +139,12 @@ def feasible_bodies(fit: Fit, target: str) -> BodyParameters:
         )
     bodies = body_parameters(fit.base.model, fit.standard_parameters)
     # Rounding may reach slightly below zero.
-    margins = np.asarray(consistency_margin(bodies))
-    is_feasible = (margins >= -1e-9) & (bodies[:, 0] > 0)
+    robot = fit.base.model.robot
+    solid_bodies = bodies[list(robot.solid_bodies)]
+    margins = np.asarray(consistency_margin(solid_bodies))
+    is_feasible = (margins >= -1e-9) & (solid_bodies[:, 0] > 0)
     if not is_feasible.all():
-        body = int(np.argmin(is_feasible)) + 1
+        body = robot.numbers[robot.solid_bodies[int(np.argmin(is_feasible))]]
         raise InputError(
             f"{target} needs physically possible bodies, but body {body} is not: "
             f"{cure}."

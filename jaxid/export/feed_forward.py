@@ -21,8 +21,9 @@ def body_parameters(model: Model, p: Float[AnyArray, " standard"]) -> BodyParame
     bodies = np.zeros((model.robot.bodies, 10))
     for term, values in model.split(np.asarray(p, np.float64)):
         if term.body_parameters:
-            rows = np.asarray(values).reshape(model.robot.bodies, -1)
-            bodies[:, : term.body_parameters] += rows
+            solid_bodies = list(model.robot.solid_bodies)
+            rows = np.asarray(values).reshape(len(solid_bodies), -1)
+            bodies[solid_bodies, : term.body_parameters] += rows
     return bodies
 
 

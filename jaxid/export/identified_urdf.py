@@ -71,9 +71,11 @@ def export_urdf(
     base = robot.source_base if base is None else base
     bodies = feasible_bodies(fit, "a URDF file")
     arguments = dict(robot.source_arguments) if is_xacro(source) else {}
-    file_robot = load_urdf(source, tip=tip, base=base, xacro_arguments=arguments)
+    place = {"tip": tip, "base": base, "xacro_arguments": arguments}
+    place["floating"] = robot.floating
+    file_robot = load_urdf(source, **place)
     _require_same_robot(robot, file_robot, source)
-    tree = UrdfTree(source, tip=tip, base=base, xacro_arguments=arguments)
+    tree = UrdfTree(source, **place)
     dynamics = joint_dynamics(fit)
     _replace_comment(tree.root, fit, (*dynamics.rotors, *dynamics.omissions))
     _replace_inertials(tree, bodies)
@@ -100,6 +102,8 @@ def _replace_inertials(tree: UrdfTree, bodies: BodyParameters) -> None:
     links += [name for name, carrier in tree.carriers.items() if carrier.body >= 0]
     body_links = [link_names(joint)[1] for joint in tree.joints]
     inertials = dict(zip(body_links, bodies, strict=True))
+    # Virtual joints, which the file does not have, move no mass.
+    inertials = {link: body for link, body in inertials.items() if body[0]}
     for name in links:
         link = tree.links[name]
         for element in link.findall("inertial"):

@@ -15,7 +15,7 @@ from jaxid.robot.follower_joints import Follower
 from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.joint_coordinates import with_leader
 from jaxid.robot.mjcf import exact_text
-from jaxid.robot.robot import Robot
+from jaxid.robot.robot import GRAVITY, Robot
 
 from .bodies_and_joint_dynamics import (
     Quantities,
@@ -86,7 +86,8 @@ def mjcf_text(
     root: Any = E.mujoco(model=robot.name)
     if comment:
         root.append(etree.Comment(comment))
-    gravity = exact_text(robot.gravity)
+    # A floating base has none: its accelerometer measures it.
+    gravity = exact_text(GRAVITY if robot.floating else robot.gravity)
     root.append(E.compiler(angle="radian", autolimits="true"))
     root.append(E.option(gravity=gravity, timestep=exact_text(timestep)))
     world = etree.SubElement(root, "worldbody")
@@ -94,15 +95,18 @@ def mjcf_text(
 
     elements: dict[int, Any] = {-1: world}
     for i in robot.order:
+        if i not in robot.solid_bodies:
+            elements[i] = elements[robot.parent[i]]
+            continue
         body = E.body(
             _inertial(np.asarray(bodies)[i]),
-            _joint(robot, i, dynamics),
+            *_joints(robot, i, dynamics),
             name=f"{robot.body_names[i]}_body",
             **placement_attributes(robot.offset[i], robot.rotation[i]),
         )
         elements[robot.parent[i]].append(body)
         elements[i] = body
-    actuators.extend(_motor(robot, joint) for joint in range(robot.joints))
+    actuators.extend(_motor(robot, joint) for joint in robot.driven)
     if robot.followers:
         led_followers = with_leader(robot.followers)
         root.append(E.equality(*(_equality(robot, f) for f in led_followers)))
@@ -123,6 +127,14 @@ def _inertial(p: Vector) -> Any:
         mass=exact_text(inertia.mass),
         fullinertia=exact_text(moments),
     )
+
+
+def _joints(robot: Robot, i: int, dynamics: Quantities) -> list[Any]:
+    """Return the joint of a body: a free one of a floating base, none of a sensor."""
+    if i not in robot.virtual:
+        return [_joint(robot, i, dynamics)]
+    is_base = robot.floating and i not in robot.rigid
+    return [E.freejoint()] if is_base else []
 
 
 def _joint(robot: Robot, i: int, dynamics: Quantities) -> Any:

@@ -35,6 +35,8 @@ class OpenShares(NamedTuple):
 
 
 OPEN_SHARES = OpenShares()
+STANDARD_GRAVITY = 9.81
+"""Acceleration of gravity [m/s²]."""
 MIN_SHARE = 0.3
 """Share of the largest parameter of a combination from which another one is named."""
 
@@ -121,6 +123,9 @@ def _random_motion(base: BaseParameters) -> Motion:
     q = reachable(robot, rng.uniform(low, high, shape))
     qd = pace * rng.uniform(-1.0, 1.0, shape) * np.asarray(limits.velocity)
     qdd = pace**2 * rng.uniform(-1.0, 1.0, shape) * np.asarray(limits.acceleration)
+    if robot.floating:
+        # Its accelerometer measures gravity as well.
+        qdd[:, 2] += STANDARD_GRAVITY
     law = base.model.memory
     return Motion(q, qd, qdd, None if law is None else law.settled(qd))
 

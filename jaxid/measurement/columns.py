@@ -12,7 +12,7 @@ from jaxid.arrays import Matrix, Vector
 from jaxid.errors import InputError
 from jaxid.io import FilePath
 from jaxid.robot.limits_and_drives import per_joint
-from jaxid.units import NM, PERCENT, RAD, Quantity, S, Unit
+from jaxid.units import NM, PERCENT, RAD, RAD_PER_S, Quantity, S, Unit
 
 from .log_files import Complaints, LogTable, Selection, open_log_file
 from .recording import positive_time
@@ -37,9 +37,11 @@ COUNTER_SIZE = 2**16
 """Number after which counters of drives begin again."""
 MIN_OVERFLOW = 0.75
 """Smallest step of a counter that begins again, relative to its size."""
+BASE_CHANNELS = ("gyro", "accelerometer", "contact")
+"""Channels of a floating base."""
 Channels = tuple[Matrix, Matrix | None, Matrix | None]
 """Angles, velocities and forces (samples x joints); None where there are none."""
-NOT_OF_JOINTS = ("time", "wrench")
+NOT_OF_JOINTS = ("time", "wrench", *BASE_CHANNELS)
 """Channels that do not have one column for each joint."""
 
 
@@ -65,6 +67,12 @@ class Columns:
         forces: Joint forces, motor torques or motor currents.
         velocities: Measured velocities, on the same side as the angles, like `"dq{}"`;
             None if there are none.
+        gyro: Angular velocity of a floating base, like `"gyro{}"`: x, y, z in the frame
+            of its IMU.
+        accelerometer: Acceleration that its IMU measures, gravity included, like
+            `"acc{}"`.
+        contact: Whether each foot stands (1) or not (0), like `"contact{}"`, in the
+            order of the robot's contacts.
         time: Time stamps, or a list of two columns with seconds and nanoseconds;
             `sample_time`, or the clock of bags and LeRobot data sets, if None.
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
@@ -76,6 +84,9 @@ class Columns:
             second if None.
         force_unit: Unit of the forces, or the force for a value of 1 in the log [N m or
             N]; currents need `torque_constants`, "%" and "‰" need `rated_forces`.
+        gyro_unit: Unit of the gyroscope.
+        accelerometer_unit: Acceleration for a value of 1 in the log [m/s²], like
+            `9.80665`.
         torque_constants: Torque of each motor for its current [N m/A].
         rated_angles: Angle of each joint at 100 % minus that at 0 % [rad or m].
         rated_velocities: Velocity of each joint at 100 % [rad/s or m/s].
@@ -101,12 +112,17 @@ class Columns:
     angles: Selection
     forces: Selection | None = None
     velocities: Selection | None = None
+    gyro: Selection | None = None
+    accelerometer: Selection | None = None
+    contact: Selection | None = None
     time: str | int | tuple[str | int, str | int] | None = None
     sample_time: float | None = None
     time_unit: Unit = S
     angle_unit: Units = RAD
     velocity_unit: Units | None = None
     force_unit: Units = NM
+    gyro_unit: Unit = RAD_PER_S
+    accelerometer_unit: float = 1.0
     torque_constants: PerJoint = None
     rated_angles: PerJoint = None
     rated_velocities: PerJoint = None
@@ -140,6 +156,7 @@ class Columns:
         self._require_unit("time_unit", Quantity.TIME)
         self._require_unit("angle_unit", Quantity.COORDINATE, Quantity.SHARE)
         self._require_unit("velocity_unit", Quantity.VELOCITY, Quantity.SHARE)
+        self._require_unit("gyro_unit", Quantity.VELOCITY)
         force = Quantity.FORCE if self.torque_constants is None else Quantity.CURRENT
         self._require_unit("force_unit", force, *FORCE_QUANTITIES)
         self._require("angle_signs", lambda s: abs(s) == 1, "+1 or -1")
@@ -169,6 +186,12 @@ class Columns:
     def _has_shares(self, name: str) -> bool:
         """Return whether a unit is a share of a rated value."""
         return Quantity.SHARE in [unit.quantity for unit in _units(getattr(self, name))]
+
+    @property
+    def base_factors(self) -> dict[str, float]:
+        """Sizes of the units of the channels of a floating base."""
+        factors = (self.gyro_unit.factor, self.accelerometer_unit, 1.0)
+        return dict(zip(BASE_CHANNELS, factors, strict=True))
 
     @property
     def angle_symbol(self) -> str:
@@ -349,6 +372,18 @@ class Log:
             )
         return self.columns.wrench_sign * values
 
+    def base_signals(self) -> dict[str, Matrix]:
+        """Return the channels of a floating base in SI units; none without columns."""
+        signals = {}
+        for table in self.tables:
+            channels = [x for x in table.channels if x in BASE_CHANNELS]
+            part = table.read(channels)
+            for channel, names in part.channels.items():
+                blocks = [part.numbers(name) for name in names]
+                factor = self.columns.base_factors[channel]
+                signals[channel] = factor * np.concatenate(blocks, axis=1)
+        return signals
+
     def _without_overflows(self, channel: str, array: Matrix) -> Matrix:
         """Return a channel whose counter goes on where it began again; note it."""
         size = COUNTER_SIZE
@@ -440,6 +475,9 @@ def open_log(
         channels["wrench"] = (path, columns.wrench)
     if columns.velocities is not None:
         channels["velocities"] = (velocities_path or path, columns.velocities)
+    for channel in BASE_CHANNELS:
+        if getattr(columns, channel) is not None:
+            channels[channel] = (path, getattr(columns, channel))
     if columns.time is not None or columns.sample_time is None:
         channels["time"] = (path, columns.time)
 

@@ -1,5 +1,7 @@
 """Observations with the states of friction that has memory."""
 
+import dataclasses
+
 import numpy as np
 
 from jaxid.dynamics.motion import Motion
@@ -43,7 +45,7 @@ class SamplesWithMemory(AbstractSamples):
         start = max(k for k in self.states if k <= samples.start)
         motion, forces = self.source.read(slice(start, samples.stop))
         state = _follow(self.law, motion, self.states[start])
-        motion = Motion(motion.q, motion.qd, motion.qdd, state)
+        motion = dataclasses.replace(motion, state=state)
         part = slice(samples.start - start, None, samples.step)
         return motion[part], forces[part]
 

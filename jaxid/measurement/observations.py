@@ -25,6 +25,7 @@ from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 
 from .filters import AbstractDecimation, AbstractFilter, Subsample, ZeroPhaseButterworth
+from .floating_base import contact_grid, contact_mask, floating_samples
 from .force_sensors import (
     measured_joints,
     on_all_joints,
@@ -376,6 +377,8 @@ def observe(
         measured_forces = np.zeros(recording.angles.shape)
 
     def load(segments: Iterable[Range]) -> SamplesInMemory:
+        if robot.floating:
+            return floating_samples(recording, robot, filter, [*segments])
         q, qd, forces = joint_side(
             robot, recording, recording.angles, recording.velocities, measured_forces
         )
@@ -391,7 +394,7 @@ def observe(
 
     observations = prepare(
         load,
-        recording.grid,
+        contact_grid(recording, robot) if robot.floating else recording.grid,
         recording.joints + len(robot.virtual),
         recording.velocities is not None,
         robot,
@@ -401,6 +404,8 @@ def observe(
         recording.name if name is None else name,
     )
     mask = observations.mask & measured_joints(robot, recording)
+    if robot.contacts:
+        mask = mask & contact_mask(robot, observations.reduced_motion)
     return observations.replace(notes=(*observations.notes, *notes), mask=mask)
 
 

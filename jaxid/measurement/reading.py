@@ -85,6 +85,7 @@ def read_recording(
         "forces": forces,
         "velocities": velocities,
         "wrench": None if columns.wrench is None else log.wrench(),
+        **log.base_signals(),
     }
     channels = {name: x for name, x in measured_channels.items() if x is not None}
     is_row = np.ones(len(angles), bool)
@@ -341,6 +342,8 @@ def scan_log(
     """
     if columns.wrench is not None:
         raise NeedsMemory("the wrench of a force sensor is read with whole logs")
+    if columns.gyro is not None:
+        raise NeedsMemory("a floating base needs its whole log")
     if columns.unwrap:
         raise NeedsMemory("`unwrap` counts the turns of whole logs")
     log = open_log(path, columns, forces_path, velocities_path, on_disk=True)

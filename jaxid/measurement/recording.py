@@ -29,6 +29,26 @@ MIN_WAY_TO_NOISE = 10.0
 """Way over noise of the angles (RMS) from which velocities are judged."""
 
 
+class BaseSignals(eqx.Module):
+    """Signals of a floating base, in the frame of its IMU.
+
+    Attributes:
+        rates: Angular velocity, as a gyroscope measures it [rad/s].
+        accelerations: Acceleration less gravity, as an accelerometer measures it
+            [m/s²].
+        contacts: Whether each foot stands, as 1 or 0 [samples contacts].
+    """
+
+    rates: Float[AnyArray, "samples 3"]
+    accelerations: Float[AnyArray, "samples 3"]
+    contacts: Float[AnyArray, "samples contacts"]
+
+    @property
+    def stands(self) -> np.ndarray:
+        """Whether each foot stands."""
+        return np.asarray(self.contacts) > 0.5
+
+
 class Recording(eqx.Module):
     """Log of one experiment: in SI units, uniform in time between gaps.
 
@@ -50,6 +70,7 @@ class Recording(eqx.Module):
         angle_unit: Unit of the angles in the file, for messages.
         wrench: Force and moment that each force sensor exerts on what is behind it [N,
             N m]; None if there are none.
+        base: Signals of a floating base; None if there are none.
     """
 
     time: Float[AnyArray, " samples"]
@@ -65,6 +86,7 @@ class Recording(eqx.Module):
     stamp_deviation: float | None = eqx.field(static=True, default=None)
     angle_unit: str = eqx.field(static=True, default="rad")
     wrench: Float[AnyArray, "samples wrenches"] | None = None
+    base: BaseSignals | None = None
 
     @classmethod
     def of(
@@ -74,6 +96,9 @@ class Recording(eqx.Module):
         *,
         velocities: ArrayLike | None = None,
         wrench: ArrayLike | None = None,
+        gyro: ArrayLike | None = None,
+        accelerometer: ArrayLike | None = None,
+        contact: ArrayLike | None = None,
         time: ArrayLike | None = None,
         sample_time: float | int | None = None,
         angles_on_motor_side: bool = False,
@@ -96,6 +121,9 @@ class Recording(eqx.Module):
             velocities: Measured velocities [rad/s or m/s].
             wrench: Force and moment that each force sensor exerts on what is behind it:
                 three forces [N], three moments [N m].
+            gyro: Angular velocity of a floating base, in the frame of its IMU [rad/s].
+            accelerometer: Acceleration that the IMU measures there [m/s²].
+            contact: Whether each foot stands, as 1 or 0 (samples x contacts).
             time: Time stamps [s]; either they or `sample_time`.
             sample_time: Time between two samples [s].
             angles_on_motor_side: Whether angles and velocities are the motors'.
@@ -126,6 +154,8 @@ class Recording(eqx.Module):
         if wrench is not None:
             size = (samples, np.shape(wrench)[-1])
             data["wrench"] = finite_channel(name, "wrench", wrench, size, first_row)
+        signals = {"gyro": gyro, "accelerometer": accelerometer, "contact": contact}
+        data |= _base_channels(name, samples, signals, first_row)
         if samples < MIN_SAMPLES:
             raise InputError(
                 f"`{name}` has {samples} samples, but at least {MIN_SAMPLES} are "
@@ -151,9 +181,11 @@ class Recording(eqx.Module):
             grid = TimeGrid(dt, {(0, samples): 0.0})
             times = [dt * np.arange(samples)]
             deviation = None
+        signals = [data.pop(key, None) for key in signals]
         return cls(
             time=np.concatenate(times),
             **data,
+            base=None if signals[0] is None else BaseSignals(*signals),
             angles_on_motor_side=angles_on_motor_side,
             forces_on_motor_side=forces_on_motor_side,
             segments=consecutive(map(len, times)),
@@ -216,6 +248,32 @@ class Recording(eqx.Module):
         segments = tuple((a, b) for a, b in bounds.tolist() if a < b)
         part = jax.tree.map(lambda x: x[start:stop], self)
         return dataclasses.replace(part, segments=segments)
+
+
+def _base_channels(
+    name: str, samples: int, signals: dict[str, Any], first_row: int
+) -> dict[str, np.ndarray]:
+    """Return the channels of a floating base, checked; nothing if there are none.
+
+    Raises:
+        InputError: If only one of gyroscope and accelerometer is there.
+    """
+    imu = [key for key in ("gyro", "accelerometer") if signals[key] is not None]
+    if not imu and signals["contact"] is None:
+        return {}
+    if len(imu) < 2:
+        raise InputError(
+            f"`{name}` must have both `gyro` and `accelerometer` of the base, but has "
+            f"{'only `' + imu[0] + '`' if imu else 'neither'}."
+        )
+    widths = dict.fromkeys(imu, 3)
+    if signals["contact"] is None:
+        signals = signals | {"contact": np.zeros((samples, 0))}
+    widths["contact"] = np.shape(signals["contact"])[-1]
+    return {
+        key: finite_channel(name, key, signals[key], (samples, width), first_row)
+        for key, width in widths.items()
+    }
 
 
 def finite_channel(

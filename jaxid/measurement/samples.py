@@ -13,6 +13,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, JointSamples
 from jaxid.dynamics.motion import Motion
 from jaxid.robot.robot import Robot
+from jaxid.robot.virtual_joints import driven_drives
 
 from .time_grid import Range
 
@@ -116,7 +117,7 @@ def joint_side(
 
     `log` is a recording, or `Columns`.
     """
-    drives = robot.drives
+    drives = driven_drives(robot)
     q = np.asarray(angles)
     qd = None if velocities is None else np.asarray(velocities)
     forces = np.asarray(forces)

@@ -219,7 +219,7 @@ def _details(report: Report, figures: Figures) -> Sections:
     tables = report.validation.tables()
     yield "Torque errors", [text, figures["errors"], *tables]
     if fit.consistency is not None:
-        names = robot.body_names
+        names = [robot.body_names[body] for body in robot.solid_bodies]
         table = body_table(fit.consistency, names, report.claimed_bodies)
         yield "Bodies", [table]
     if fit.residual_spectra is not None:

@@ -34,13 +34,14 @@ def joint_table(report: Report) -> Table:
     sources = [_estimate_texts(fit), *_claim_texts(report)]
     has_claims = len(sources) > 1
     heads = []
-    for name in robot.body_names:
+    bodies = robot.solid_bodies
+    for name in (robot.body_names[body] for body in bodies):
         heads.append(name)
         if has_claims:
             heads.append("in the robot's file")
     columns = [Column("joint", heads)]
     for symbol, meaning in _meanings(fit.base.model).items():
-        names = [f"{symbol}{number}" for number in range(1, robot.bodies + 1)]
+        names = [f"{symbol}{robot.numbers[body]}" for body in bodies]
         known_names = [name for name in names if name in units]
         if known_names:
             texts = [source.get(name, MISSING) for name in names for source in sources]

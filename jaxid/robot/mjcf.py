@@ -1,8 +1,9 @@
 """The kinematic tree of an MJCF file, which MuJoCo compiles, written as a URDF."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -13,6 +14,8 @@ from jaxid.arrays import Matrix3, Numbers, Vector3
 from jaxid.errors import InputError
 from jaxid.io import import_extra
 
+from .contacts import AbstractContactShape, Sole, Sphere
+from .mjcf_flags import switch_off
 from .rotations import axis_rotation, rpy_angles
 
 JOINT_TYPES = ("floating", "ball", "prismatic", "revolute")
@@ -41,28 +44,6 @@ EFFECTS = {
     ),
 }
 """Arrays of effects beside the default model: kind of the elements, and words."""
-SWITCHED_ARRAYS = {
-    "SPRING": (
-        "jnt_stiffness",
-        "jnt_stiffnesspoly",
-        "jnt_springyield",
-        "tendon_stiffness",
-        "tendon_stiffnesspoly",
-    ),
-    "DAMPER": (
-        "dof_damping",
-        "dof_dampingpoly",
-        "tendon_damping",
-        "tendon_dampingpoly",
-        "actuator_damping",
-        "actuator_dampingpoly",
-    ),
-    "FRICTIONLOSS": ("dof_frictionloss", "tendon_frictionloss"),
-    "EQUALITY": ("eq_active0",),
-    "CONSTRAINT": ("dof_frictionloss", "tendon_frictionloss", "eq_active0"),
-    "GRAVITY": ("body_gravcomp",),
-}
-"""Arrays of effects that a flag of MuJoCo switches off, by the name of its bit."""
 
 
 class Effect(NamedTuple):
@@ -105,6 +86,7 @@ class Description(NamedTuple):
         effects: Effects on forces that the default model leaves out.
         motors: Names of the joints that have an actuator.
         poses: Coordinates of joints by their names, in the poses that the file states.
+        contacts: Shapes of feet, by the names of their links.
     """
 
     root: Any
@@ -113,6 +95,7 @@ class Description(NamedTuple):
     effects: Sequence[Effect] = ()
     motors: Sequence[str] = ()
     poses: Sequence[dict[str, float]] = ()
+    contacts: Mapping[str, AbstractContactShape] = MappingProxyType({})
 
 
 def import_mujoco() -> Any:
@@ -137,7 +120,7 @@ def mjcf_as_urdf(path: str | Path) -> Description:
         raise InputError(
             f"`{path}`: MuJoCo cannot compile this file: {reason}."
         ) from error
-    _switch_off(mujoco, model)
+    switch_off(mujoco, model)
     _carry_to_joints(mujoco, model)
     tree = _Writer(mujoco, model)
     for body in range(1, model.nbody):
@@ -153,7 +136,13 @@ def mjcf_as_urdf(path: str | Path) -> Description:
         model.body_gravcomp[:] = 0.0
     tree.add_effects()
     return Description(
-        tree.root, gravity, tree.loops, tree.effects, tree.motors(), tree.poses()
+        tree.root,
+        gravity,
+        tree.loops,
+        tree.effects,
+        tree.motors(),
+        tree.poses(),
+        tree.add_feet(),
     )
 
 
@@ -326,6 +315,28 @@ class _Writer:
         body_link = self._links[model.site_bodyid[site]]
         self._connect(f"{name} site", "fixed", body_link, name, origin)
 
+    def add_feet(self) -> dict[str, AbstractContactShape]:
+        """Write links at bodies that end the tree and collide; return their shapes."""
+        model = self._model
+        spheres = self._mujoco.mjtGeom.mjGEOM_SPHERE
+        contacts = {}
+        for body in range(1, model.nbody):
+            first = model.body_geomadr[body]
+            geoms = np.arange(first, first + model.body_geomnum[body])
+            geoms = geoms[
+                (model.geom_contype[geoms] | model.geom_conaffinity[geoms]) > 0
+            ]
+            if body in model.body_parentid or not len(geoms):
+                continue
+            name = f"{self._links[body]} foot"
+            is_ball = len(geoms) == 1 and model.geom_type[geoms[0]] == spheres
+            radius = model.geom_size[geoms[0], 0]
+            contacts[name] = Sphere(radius) if is_ball else Sole()
+            self.root.append(E.link(name=name))
+            origin = _origin(np.eye(3), model.geom_pos[geoms].mean(axis=0))
+            self._connect(f"{name} mount", "fixed", self._links[body], name, origin)
+        return contacts
+
     def add_constraint(self, constraint: int):
         """Write a constraint between joints as a mimic; note one that closes a loop."""
         model = self._model
@@ -414,24 +425,6 @@ class _Writer:
         attributes["multiplier"] = exact_text(slope)
         attributes["offset"] = exact_text(ref + change)
         self._joints[joint].append(E.mimic(**attributes))
-
-
-def _switch_off(mujoco: Any, model: Any):
-    """Set to zero what the flags of a compiled model switch off."""
-    bits = mujoco.mjtDisableBit
-    flags = model.opt.disableflags
-    for name, arrays in SWITCHED_ARRAYS.items():
-        if flags & getattr(bits, f"mjDSBL_{name}"):
-            for array in arrays:
-                # Earlier versions of MuJoCo lack some arrays.
-                getattr(model, array, np.zeros(0))[:] = 0
-    if flags & bits.mjDSBL_GRAVITY:
-        model.opt.gravity[:] = 0.0
-    # Without springs and dampers MuJoCo computes no passive forces at all.
-    if flags & bits.mjDSBL_SPRING and flags & bits.mjDSBL_DAMPER:
-        model.body_gravcomp[:] = 0.0
-        model.opt.density = 0.0
-        model.opt.viscosity = 0.0
 
 
 def _carry_to_joints(mujoco: Any, model: Any):

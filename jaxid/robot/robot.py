@@ -23,6 +23,7 @@ from jaxid.arrays import (
 from jaxid.errors import InputError
 from jaxid.result_table import Column, Remark, Status, Summarised, Table
 
+from .contacts import Contact, Imu
 from .follower_joints import Followers, Loop, order_from_ground
 from .inertia import IMPOSSIBLE, Tool
 from .joint_coordinates import close_loops
@@ -82,6 +83,8 @@ class Robot(Summarised, Hashable):
         virtual: Indices of joints that nothing drives, in groups of six for the forces
             between two bodies; coordinates are zero (`virtual_joints`).
         floating: Whether the first group carries a base that moves.
+        imu: Place of the IMU on that base.
+        contacts: Points and soles at which it may touch the ground.
 
     Raises:
         InputError: If shapes do not fit, a parent comes after its child, an axis is
@@ -117,6 +120,8 @@ class Robot(Summarised, Hashable):
     notes: tuple[str, ...] = eqx.field(static=True, default=())
     virtual: tuple[int, ...] = eqx.field(static=True, default=())
     floating: bool = eqx.field(static=True, default=False)
+    imu: Imu = eqx.field(static=True, default=Imu())
+    contacts: tuple[Contact, ...] = eqx.field(static=True, default=())
 
     def __post_init__(self):
         if not self.revolute:

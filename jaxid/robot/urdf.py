@@ -9,6 +9,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Joints, Numbers
 from jaxid.errors import InputError
 
+from .contacts import AbstractContactShape, Imu, contact_at, imu_at
 from .follower_joints import Followers
 from .inertia import IMPOSSIBLE, MAX_DENSITY, ball_densities
 from .joint_coordinates import linear_coordinates, linear_ratios, with_leader
@@ -44,6 +45,8 @@ def load_urdf(
     base_position: Numbers = ORIGIN,
     xacro_arguments: Mapping[str, str] | None = None,
     floating: bool = False,
+    imu: str | Imu | None = None,
+    contacts: Mapping[str, AbstractContactShape] | None = None,
 ) -> Robot:
     """Load a robot from a URDF, xacro or MJCF file, without its inertias.
 
@@ -80,6 +83,11 @@ def load_urdf(
         floating: Whether the base moves freely: it is a body on six virtual joints,
             whose acceleration, gravity included, an IMU measures. `base` is then the
             link of the base: the root if None, or the link that the file lets float.
+        imu: Link (body or site) of the IMU, or its place on the base; the frame of the
+            base if None.
+        contacts: Links of the feet of a floating base, and their shapes, in the order
+            of the logs' flags; if None, those of an MJCF file: bodies at the ends of
+            the tree that collide, a ball as `Sphere`, any other as `Sole`.
 
     Raises:
         FileNotFoundError: If the file does not exist.
@@ -109,6 +117,8 @@ def load_urdf(
             notes = (*_mount_notes(tree, base), *notes)
     joints = _leading_joints(tree)
     tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
+    if contacts is None:
+        contacts = tree.contact_shapes if floating else {}
     try:
         robot = Robot(
             tree.name,
@@ -133,6 +143,10 @@ def load_urdf(
             notes=notes,
             virtual=tuple(range(GROUP)) if floating else (),
             floating=floating,
+            imu=imu_at(tree, imu),
+            contacts=tuple(
+                contact_at(tree, link, shape) for link, shape in contacts.items()
+            ),
         )
         robot = robot.mounted(base_rotation, base_position)
         if not tree.loops:

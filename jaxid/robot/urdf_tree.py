@@ -61,6 +61,7 @@ class UrdfTree(UrdfElements):
         effects: Effects on forces of bodies that the default model leaves out.
         objects: Names of links that float and move no joint, which are left out.
         tip: Name of the end-effector's link.
+        contact_shapes: Shapes of the feet of an MJCF file, by the names of their links.
         floating: Whether the base is on virtual joints.
         compiled: Whether the file is MJCF, whose shapes are no elements of the links.
     """
@@ -77,7 +78,8 @@ class UrdfTree(UrdfElements):
         self.path = str(path)
         self.floating = floating
         description = read_description(path, xacro_arguments)
-        self.root, self.gravity, loops, effects, motors, self.poses = description
+        self.root, self.gravity, loops, effects, motors, self.poses = description[:6]
+        self.contact_shapes = description.contacts
         self.compiled = is_mjcf(path)
         name = self.root.get("name") or Path(path).stem
         self.name = "".join(c if c.isprintable() else " " for c in name)
@@ -94,8 +96,8 @@ class UrdfTree(UrdfElements):
             self._add(joint)
 
         root = self._find_root()
-        self._require_link("base", base)
-        self._require_link("tip", tip)
+        self.require_link("base", base)
+        self.require_link("tip", tip)
         self.followers: Followers = ()
         self.base_gravity = np.array(self.gravity, np.float64)
         self.tilting_joints = []
@@ -117,7 +119,7 @@ class UrdfTree(UrdfElements):
 
     def _float(self, base: str | None):
         """Put the base on virtual joints; return the link that carries them."""
-        self._require_link("base", base)
+        self.require_link("base", base)
         above = {link_names(joint)[1]: joint for joint in self.named_joints.values()}
         for joint in self.named_joints.values():
             if joint.get("type") == "floating":
@@ -137,7 +139,7 @@ class UrdfTree(UrdfElements):
             self.links.setdefault(link.get("name"), link)
         return ground
 
-    def _require_link(self, argument: str, link: str | None):
+    def require_link(self, argument: str, link: str | None):
         """Reject an argument that names no link."""
         if link is not None and link not in self.links:
             raise InputError(

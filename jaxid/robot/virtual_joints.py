@@ -188,6 +188,60 @@ def padded(owner: Any, before: int, after: int) -> Any:
     return dataclasses.replace(owner, joints=joints, **fields)
 
 
+def driven_drives(robot: Any) -> Any:
+    """Return the drives of the joints that are not virtual."""
+    drives = robot.drives
+    if not robot.virtual:
+        return drives
+    driven = np.array(robot.driven)
+    fields = {}
+    for field in dataclasses.fields(drives):
+        values = getattr(drives, field.name, None)
+        if isinstance(values, np.ndarray):
+            fields[field.name] = values[np.ix_(*[driven] * values.ndim)]
+    return dataclasses.replace(drives, joints=len(driven), **fields)
+
+
+def driven_robot(robot: Any) -> Any:
+    """Return the driven joints as a robot of their own, for what logs hold of them."""
+    if not robot.virtual:
+        return robot
+    joints = list(robot.driven)
+    limits = {}
+    for field in dataclasses.fields(robot.limits):
+        values = getattr(robot.limits, field.name, None)
+        if isinstance(values, np.ndarray):
+            limits[field.name] = values[joints]
+    return robot.replace(
+        joint_names=tuple(robot.joint_names[i] for i in joints),
+        parent=None,
+        followers=(),
+        revolute=tuple(robot.revolute[i] for i in joints),
+        axis=robot.axis[joints],
+        rotation=robot.rotation[joints],
+        offset=robot.offset[joints],
+        limits=dataclasses.replace(robot.limits, joints=len(joints), **limits),
+        drives=driven_drives(robot),
+        tool=None,
+        tip_body=None,
+        virtual=(),
+        floating=False,
+        contacts=(),
+    )
+
+
+def with_driven(robot: Any, joints: Any) -> Any:
+    """Return the robot with the limits and drives of its driven joints replaced."""
+    if not robot.virtual:
+        return joints
+    before = len([i for i in robot.virtual if i < robot.driven[0]])
+    after = len(robot.virtual) - before
+    return robot.replace(
+        limits=padded(joints.limits, before, after),
+        drives=padded(joints.drives, before, after),
+    )
+
+
 UNKNOWN = {
     "position_min": -np.inf,
     "zero": 0.0,

@@ -6,7 +6,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Numbers
+from jaxid.arrays import AnyArray, Indices, Numbers
+from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.delay import Delay
 from jaxid.identification.fit_result import Fit
@@ -23,6 +24,7 @@ from jaxid.result_table import (
     significant,
 )
 from jaxid.robot.robot import Robot
+from jaxid.robot.virtual_joints import driven_robot
 
 from .clipped_forces import clipped_forces, limited_forces
 from .clock import clock_finding, held_forces
@@ -166,7 +168,10 @@ def diagnose(
     """
     examined_log = _examined_log(log, robot, observations, min_speed)
     excerpt = examined_log.excerpt
-    statistics = _statistics(examined_log.all_observations, robot.joints, progress)
+    # Channels are those of the driven joints; the other rows follow from an IMU.
+    driven = robot.driven
+    robot = driven_robot(robot)
+    statistics = _statistics(examined_log.all_observations, driven, progress)
     faults = channel_findings(robot, excerpt, statistics)
     faulty_joints = tuple(dict.fromkeys(joint for joint, _ in faults))
     clock_text = clock_finding(excerpt)
@@ -252,10 +257,11 @@ def _examined_log(
 
 
 def _statistics(
-    observations: Observations, joints: int, progress: Progress | None
+    observations: Observations, driven: Indices, progress: Progress | None
 ) -> LogStatistics:
     """Return the statistics of a whole log, which is read in parts from the disk."""
-    statistics = LogStatistics(joints, observations.samples)
+    statistics = LogStatistics(len(driven), observations.samples)
+    joints = list(driven)
     is_on_disk = isinstance(observations.source, SamplesOnDisk)
     for a, b in observations.segments:
         # Differences at the ends of parts are not central: logs in memory are taken at
@@ -264,7 +270,8 @@ def _statistics(
         for start in range(a, b, step):
             samples = slice(start, min(start + step, b))
             motion, forces = observations.read(samples)
-            statistics.add(motion, forces, observations.sample_time)
+            motion = Motion(*(x[:, joints] for x in (motion.q, motion.qd, motion.qdd)))
+            statistics.add(motion, forces[:, joints], observations.sample_time)
             if progress is not None:
                 progress(samples.stop / observations.samples)
     return statistics
@@ -317,6 +324,8 @@ def _mistakes(
 ) -> LogMistakes:
     """Return the mistake that explains most, and what only a model reveals."""
     model = fit.base.model
+    if model.robot.virtual:
+        return LogMistakes()
     recordings = []
     commands = []
     doubts = []

@@ -83,12 +83,12 @@ class TorqueErrors(eqx.Module):
     @property
     def mean(self) -> Vector:
         """Mean absolute error of each joint [N m or N] (Eq. 37)."""
-        return np.nanmean(np.abs(self.errors), axis=0)
+        return _means(np.abs(self.errors))
 
     @property
     def rms(self) -> Vector:
         """RMS error of each joint [N m or N]."""
-        return np.sqrt(np.nanmean(self.errors**2, axis=0))
+        return np.sqrt(_means(self.errors**2))
 
     @property
     def mean_percent(self) -> Vector:
@@ -114,7 +114,7 @@ class TorqueErrors(eqx.Module):
     @property
     def force_rms(self) -> Vector:
         """RMS of the measured forces of each joint [N m or N]."""
-        return np.sqrt(np.nanmean(self.counted_forces**2, axis=0))
+        return np.sqrt(_means(self.counted_forces**2))
 
     @property
     def rms_relative(self) -> Vector:
@@ -134,6 +134,12 @@ class TorqueErrors(eqx.Module):
     def counted_forces(self) -> np.ndarray:
         """Measured forces [N m or N]; NaN where a row does not count."""
         return np.where(self.counted, np.asarray(self.measured), np.nan)
+
+
+def _means(values: np.ndarray) -> Vector:
+    """Return the means of columns over rows that count; NaN where none does."""
+    counts = np.isfinite(values).sum(axis=0)
+    return _ratio(np.nansum(values, axis=0), counts)
 
 
 def _chance(errors: Vector, speeds: Vector) -> float:

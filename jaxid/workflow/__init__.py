@@ -1,5 +1,7 @@
 """The work of the commands as functions: from logs to a report, with one setup."""
 
+from jaxid.validation.contact_flags import check_contacts as check_contacts
+
 from .excitation_settings import Excitation as Excitation, Leads as Leads
 from .force_sensor_payload import ForceSensor as ForceSensor
 from .geometry_calibration import (

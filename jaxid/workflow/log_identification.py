@@ -97,7 +97,7 @@ class IdentificationReport(Summarised, Report):
         robot = fit.base.model.robot
         tables = [robot.summary(), *motor_tables(robot), fit.summary()]
         if fit.consistency is not None:
-            names = robot.body_names
+            names = [robot.body_names[body] for body in robot.solid_bodies]
             tables.append(body_table(fit.consistency, names, self.claimed_bodies))
         tables += self.validation.tables()
         findings = self.judgement.findings
@@ -267,7 +267,8 @@ def resolution_notes(fit: Fit, logs: Sequence[LoadedLog]) -> list[str]:
     notes = []
     for observations, diagnosis in logs:
         recording = diagnosis.log
-        if isinstance(recording, Recording) and not diagnosis.faulty:
+        has_joints_only = not fit.base.model.robot.virtual and not diagnosis.faulty
+        if isinstance(recording, Recording) and has_joints_only:
             texts = resolution_note(fit, recording, observations)
             notes += [f"{recording.name}: {text}" for text in texts]
     return notes

@@ -21,6 +21,7 @@ from jaxid.measurement.recording import Recording, remove_delay
 from jaxid.measurement.time_grid import NeedsMemory
 from jaxid.robot.robot import Robot
 from jaxid.units import NM
+from jaxid.validation.contact_flags import check_contacts
 from jaxid.validation.diagnosis import Diagnosis, diagnose
 from jaxid.validation.torque_errors import comparison_step
 
@@ -197,6 +198,10 @@ def load_log(
     if name is not None:
         recording = dataclasses.replace(recording, name=name)
     progress(f"filtering {path.name}", 0.0)
+    contact_findings = ()
+    if setup.robot.contacts:
+        checked = check_contacts(setup.base, recording, setup.filter)
+        recording, contact_findings = checked
     observations = setup.observe(recording)
     diagnosis = diagnose(
         recording,
@@ -204,6 +209,8 @@ def load_log(
         observations=observations,
         commands=commanded_log(setup, path, columns),
     )
+    findings = (*diagnosis.findings, *contact_findings)
+    diagnosis = dataclasses.replace(diagnosis, findings=findings)
     observations = observations.replace(notes=(*observations.notes, *notes))
     return LoadedLog(observations, diagnosis)
 
@@ -272,6 +279,9 @@ def select_filter(
     """
     if not setup.filter_candidates or not logs:
         return setup
+    if setup.robot.floating:
+        # Stretches between two changes of contact are too short for a comparison.
+        return dataclasses.replace(setup, filter_candidates=())
     rows = sum(map(estimated_rows, logs))
     step = max(1, round(rows / MAX_CHOICE_SAMPLES))
     excerpts = []

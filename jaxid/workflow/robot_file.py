@@ -12,6 +12,7 @@ from jaxid.identification.consistency import consistency_margin
 from jaxid.io import FilePath
 from jaxid.robot.capsule_fit import placed_shapes
 from jaxid.robot.collision_geometry import BodyShape
+from jaxid.robot.contacts import AbstractContactShape
 from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
 from jaxid.robot.urdf import joint_parameters, load_urdf
@@ -30,6 +31,9 @@ class RobotFile:
             parallel frames.
         base_position: Position of the base in the frame of the ground [m].
         xacro_arguments: Texts of the arguments of a xacro file, by name.
+        floating: Whether the base moves freely.
+        imu: Link of the IMU on a floating base.
+        contacts: Links of the feet of a floating base, and their shapes.
     """
 
     path: FilePath
@@ -38,6 +42,9 @@ class RobotFile:
     base_rotation: Float[np.ndarray, "3 3"] | None = None
     base_position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     xacro_arguments: Mapping[str, str] = dataclasses.field(default_factory=dict)
+    floating: bool = False
+    imu: str | None = None
+    contacts: Mapping[str, AbstractContactShape] | None = None
 
     @property
     def chain(self) -> dict[str, Any]:
@@ -46,6 +53,7 @@ class RobotFile:
             "tip": self.tip,
             "base": self.base,
             "xacro_arguments": self.xacro_arguments,
+            "floating": self.floating,
         }
 
     @property
@@ -58,7 +66,14 @@ class RobotFile:
 
     def load(self, gravity: Numbers | None = None) -> Robot:
         """Load the robot; gravity in the frame of the ground is the file's if None."""
-        return load_urdf(self.path, gravity=gravity, **self.chain, **self.placement)
+        return load_urdf(
+            self.path,
+            gravity=gravity,
+            imu=self.imu,
+            contacts=self.contacts,
+            **self.chain,
+            **self.placement,
+        )
 
     def shapes(self) -> list[BodyShape]:
         """Return the shapes that can be read, each with its body, in the body's frame.
@@ -105,7 +120,9 @@ class RobotFile:
             return {}
         if not np.any(bodies):
             return {}
-        return _named_bodies(bodies) | self._joint_claims()
+        # A floating base has the number 0.
+        first_number = 0 if self.floating else 1
+        return _named_bodies(bodies, first_number) | self._joint_claims()
 
     def _joint_claims(self) -> dict[str, float]:
         """Return claimed rotors, friction and springs, by their names in a model."""
@@ -121,11 +138,11 @@ class RobotFile:
         return claims
 
 
-def _named_bodies(bodies: np.ndarray) -> dict[str, float]:
+def _named_bodies(bodies: np.ndarray, first_number: int) -> dict[str, float]:
     """Return the parameters of bodies by their names in a model."""
     return {
         f"{symbol}{number}": float(value)
-        for number, body in enumerate(bodies, 1)
+        for number, body in enumerate(bodies, first_number)
         for symbol, value in zip(INERTIAL_NAMES, body, strict=True)
     }
 

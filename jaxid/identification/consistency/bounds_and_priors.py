@@ -111,7 +111,7 @@ class BodyBounds(eqx.Module):
                 extents[parent] = max(extents[parent], lengths[body])
         return cls(
             mass_max=MASS_PER_SQUARED_REACH * reach**2,
-            radius=extents + OVERHANG * reach,
+            radius=extents[list(robot.solid_bodies)] + OVERHANG * reach,
         )
 
     def replace(self, **fields: Any) -> "BodyBounds":

@@ -152,14 +152,13 @@ def feasible_set(model: Model, bounds: BodyBounds) -> FeasibleSet:
         raise InputError(
             "the model has no bodies to make consistent: add `RigidBodies()`."
         )
-    if len(bounds.radius) != robot.bodies:
-        raise InputError(
-            f"`bounds` must be those of the {robot.bodies} bodies of the robot."
-        )
+    bodies = len(robot.solid_bodies)
+    if len(bounds.radius) != bodies:
+        raise InputError(f"`bounds` must be those of the {bodies} bodies of the robot.")
     number = next(k for k, width in enumerate(widths) if width)
     sizes = [len(term.parameters(robot)) for term in model.terms]
     start = sum(sizes[:number])
-    columns = np.arange(start, start + sizes[number]).reshape(robot.bodies, -1)
+    columns = np.arange(start, start + sizes[number]).reshape(bodies, -1)
 
     other_columns = np.setdiff1d(np.arange(model.size), columns)
     # Terms tell that parameters cannot be negative by a lower bound of zero.

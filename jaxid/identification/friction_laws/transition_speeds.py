@@ -199,11 +199,10 @@ def transition_note(base: BaseParameters) -> str:
     robot = base.model.robot
     leaves = jax.tree.leaves(base.model.terms, is_leaf=_is_smooth)
     transition = next(x for x in leaves if _is_smooth(x))
+    speeds = np.asarray(transition.speed).tolist()
     words = [
-        f"{name} {speed:.2g} {robot.joint_unit(joint)}/s"
-        for joint, (name, speed) in enumerate(
-            zip(robot.joint_names, np.asarray(transition.speed).tolist(), strict=True)
-        )
+        f"{robot.joint_names[joint]} {speeds[joint]:.2g} {robot.joint_unit(joint)}/s"
+        for joint in robot.driven
     ]
     return (
         "dry friction changes sign within about these speeds, found from the "

@@ -1,0 +1,247 @@
+"""Logs of a floating base: motion from its IMU, and rows without contact forces.
+
+The accelerometer measures gravity too, so that attitude, velocity and position of the
+base are not needed. Only the lowest point of a ball foot depends on the vertical: the
+mean direction of the measured acceleration, since a base does not accelerate forever.
+"""
+
+import dataclasses
+import itertools
+
+import numpy as np
+import scipy
+
+from jaxid.arrays import AnyArray, Float, Matrix
+from jaxid.dynamics.motion import Motion, floating_motion
+from jaxid.errors import InputError
+from jaxid.robot.contacts import legs_of
+from jaxid.robot.forward_kinematics import tip_jacobian
+from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import rpy_rotation
+
+from .filters import AbstractFilter
+from .recording import BaseSignals, Recording
+from .samples import SamplesInMemory, joined, joint_side
+from .time_grid import Range, TimeGrid
+
+GUARD = 0.1
+"""Time around each change of contact that is left out: flags are early or late [s]."""
+VERTICAL_TIME = 2.0
+"""Time over which the acceleration is averaged to find the vertical [s]."""
+
+
+def base_of(recording: Recording, robot: Robot) -> BaseSignals:
+    """Return the signals of the base of a recording.
+
+    Raises:
+        InputError: If the recording has none, or flags of other contacts.
+    """
+    signals = recording.base
+    if signals is None:
+        raise InputError(
+            f"`{recording.name}` has no signals of an IMU, which a floating base "
+            "needs: name the columns `gyro`, `accelerometer` and `contact`."
+        )
+    if signals.contacts.shape[1] != len(robot.contacts):
+        names = ", ".join(contact.name for contact in robot.contacts)
+        raise InputError(
+            f"`contact` of `{recording.name}` has {signals.contacts.shape[1]} columns, "
+            f"but `{robot.name}` has {len(robot.contacts)} contacts ({names}): name "
+            "one column for each."
+        )
+    return signals
+
+
+def contact_grid(recording: Recording, robot: Robot) -> TimeGrid:
+    """Return the stretches of a recording without a change of contact, and guards."""
+    grid = recording.grid
+    stands = base_of(recording, robot).stands
+    guard = round(GUARD / grid.sample_time)
+    segments = {}
+    for (a, b), time in grid.segments.items():
+        is_change = (np.diff(stands[a:b].astype(int), axis=0) != 0).any(axis=1)
+        changes = (a + 1 + np.flatnonzero(is_change)).tolist()
+        for start, stop in itertools.pairwise([a, *changes, b]):
+            first = start if start == a else start + guard
+            end = stop if stop == b else stop - guard
+            if end > first:
+                segments[first, end] = time + (first - a) * grid.sample_time
+    return grid._replace(segments=segments)
+
+
+def floating_samples(
+    recording: Recording, robot: Robot, filter: AbstractFilter, segments: list[Range]
+) -> SamplesInMemory:
+    """Return motion and forces, without those of contacts, of some stretches."""
+    signals = base_of(recording, robot)
+    q, qd, forces = joint_side(
+        robot, recording, recording.angles, recording.velocities, recording.forces
+    )
+    parts = []
+    for a, b in recording.segments:
+        samples = slice(a, b)
+        joint_motion = filter.motion(
+            q[samples], None if qd is None else qd[samples], recording.sample_time
+        )
+        signals_of_part = dataclasses.replace(
+            signals,
+            rates=np.asarray(signals.rates)[samples],
+            accelerations=np.asarray(signals.accelerations)[samples],
+            contacts=np.asarray(signals.contacts)[samples],
+        )
+        motion = _with_base(
+            robot, joint_motion, signals_of_part, filter, recording.sample_time
+        )
+        parts.append((motion, _all_forces(robot, motion, forces[samples])))
+    motion, every_force = joined(parts)
+    stretches = [(motion[a:b], every_force[a:b]) for a, b in segments]
+    return SamplesInMemory(*joined(stretches))
+
+
+def _with_base(
+    robot: Robot,
+    joints: Motion,
+    signals: BaseSignals,
+    filter: AbstractFilter,
+    sample_time: float,
+) -> Motion:
+    """Return the motion of all joints and the base, with what eliminates contacts."""
+    attitude = rpy_rotation(robot.imu.rpy)
+    turning = filter.motion(signals.rates @ attitude.T, None, sample_time)
+    measured = signals.accelerations @ attitude.T
+    rates = turning.q
+    angular_accelerations = turning.qd
+    arm = np.asarray(robot.imu.position)
+    accelerations = filter.motion(measured, None, sample_time).q
+    accelerations = accelerations - np.cross(angular_accelerations, arm)
+    accelerations = accelerations - np.cross(rates, np.cross(rates, arm))
+    motion = floating_motion(
+        joints.q, joints.qd, joints.qdd, accelerations, rates, angular_accelerations
+    )
+    if not robot.contacts:
+        return motion
+    up = vertical(rates, accelerations, sample_time)
+    entries = elimination(robot, motion.q, up, signals.stands)
+    return dataclasses.replace(motion, contacts=entries)
+
+
+def vertical(
+    rates: AnyArray, accelerations: AnyArray, sample_time: float
+) -> Float[np.ndarray, "samples 3"]:
+    """Return unit vectors against gravity in the frame of the base.
+
+    The rates tell how the base turns; along axes that do not turn, the mean of the
+    measured acceleration is that of gravity.
+    """
+    rotation = scipy.spatial.transform.Rotation
+    steps = rotation.from_rotvec(rates * sample_time).as_matrix()
+    # Products of the first 1, 2, 4, ... steps: attitudes relative to the first one.
+    attitudes = np.concatenate([np.eye(3)[None], steps[:-1]])
+    shift = 1
+    while shift < len(attitudes):
+        products = attitudes[:-shift] @ attitudes[shift:]
+        attitudes = np.concatenate([attitudes[:shift], products])
+        shift *= 2
+    inertial = np.einsum("nij,nj->ni", attitudes, accelerations)
+    width = min(round(VERTICAL_TIME / sample_time), len(inertial))
+    mean = inertial
+    for _ in range(2):
+        mean = scipy.ndimage.uniform_filter1d(mean, width, axis=0, mode="nearest")
+    up = np.einsum("nji,nj->ni", attitudes, mean)
+    return up / np.linalg.norm(up, axis=1, keepdims=True)
+
+
+def _all_forces(robot: Robot, motion: Motion, forces: Matrix) -> Matrix:
+    """Return the forces of all rows: those of the base come from standing legs."""
+    every_force = np.zeros((len(forces), robot.joints))
+    every_force[:, list(robot.driven)] = forces
+    if motion.contacts is not None:
+        legs = legs_of(robot)
+        X = motion.contacts.reshape(len(forces), len(legs.rows), len(legs.joints))
+        leg_forces = every_force[:, list(legs.joints)]
+        every_force[:, list(legs.rows)] -= np.einsum("nij,nj->ni", X, leg_forces)
+    return every_force
+
+
+def elimination(
+    robot: Robot, q: AnyArray, up: AnyArray, stands: AnyArray
+) -> np.ndarray:
+    """Return $X$ of all legs at many samples, zero where a foot does not stand.
+
+    Args:
+        robot: Robot with contacts.
+        q: Coordinates [samples joints].
+        up: Unit vector against gravity in the frame of the base [samples 3].
+        stands: Whether each contact stands [samples contacts].
+
+    Returns:
+        Entries of $X$, row by row [samples entries].
+    """
+    legs = legs_of(robot)
+    matrices = []
+    for number, contact in enumerate(robot.contacts):
+        foot = robot.replace(tip_body=contact.body, tip_offset=contact.position)
+        tip = tip_jacobian(foot, np.asarray(q))
+        # Joints in the order of their numbers.
+        order = np.argsort(robot.order)
+        velocity = tip.velocity[:, order]
+        turn = tip.turn[:, order]
+        jacobian = contact.shape.jacobian(velocity, turn, up)
+        force_of_leg = np.linalg.pinv(jacobian[:, list(legs.own_joints[number])])
+        X = jacobian[:, list(legs.rows)] @ force_of_leg
+        matrices.append(np.where(stands[:, number, None, None], X, 0.0))
+    return np.concatenate(matrices, axis=2).reshape(len(q), -1)
+
+
+def contact_mask(robot: Robot, motion: Motion) -> np.ndarray:
+    """Return the rows that count: not those of the joints of legs that stand."""
+    mask = np.ones(motion.q.shape, bool)
+    if motion.contacts is not None:
+        legs = legs_of(robot)
+        X = motion.contacts.reshape(len(mask), len(legs.rows), len(legs.joints))
+        mask[:, list(legs.joints)] = (X == 0.0).all(axis=1)
+    return mask
+
+
+def all_standing(recording: Recording, robot: Robot) -> Recording:
+    """Return a recording in which all feet are called standing."""
+    signals = base_of(recording, robot)
+    contacts = np.ones(signals.contacts.shape)
+    signals = dataclasses.replace(signals, contacts=contacts)
+    return dataclasses.replace(recording, base=signals)
+
+
+def measured_vertical(recording: Recording, robot: Robot) -> tuple[np.ndarray, float]:
+    """Return the vertical in the frame of the base, and the mean acceleration [m/s²].
+
+    The vertical is that of all samples [samples 3], as if there were no gaps.
+    """
+    signals = base_of(recording, robot)
+    attitude = rpy_rotation(robot.imu.rpy)
+    rates = np.asarray(signals.rates) @ attitude.T
+    accelerations = np.asarray(signals.accelerations) @ attitude.T
+    up = vertical(rates, accelerations, recording.sample_time)
+    return up, float(np.mean(np.sum(up * accelerations, axis=1)))
+
+
+def feet_normal(recording: Recording, robot: Robot) -> np.ndarray | None:
+    """Return the normal of the plane of the feet where all stand [samples 3].
+
+    None for fewer than three feet, or where they never stand together.
+    """
+    stands = base_of(recording, robot).stands.all(axis=1)
+    if len(robot.contacts) < 3 or not stands.any():
+        return None
+    q, _, _ = joint_side(robot, recording, recording.angles, None, recording.forces)
+    angles = np.zeros((np.count_nonzero(stands), robot.joints))
+    angles[:, list(robot.driven)] = q[stands]
+    points = []
+    for contact in robot.contacts:
+        foot = robot.replace(tip_body=contact.body, tip_offset=contact.position)
+        points.append(tip_jacobian(foot, angles).position)
+    feet = np.stack(points, axis=1)
+    feet = feet - feet.mean(axis=1, keepdims=True)
+    normal = np.linalg.svd(feet)[2][:, 2]
+    # The base is above the feet.
+    height = np.sum(normal * points[0], axis=1, keepdims=True)
+    return np.where(height > 0.0, -normal, normal)

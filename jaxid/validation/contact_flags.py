@@ -1,0 +1,176 @@
+"""Checks of a robot on legs: flags of contact, and the frame of its IMU.
+
+A foot that is wrongly called standing costs information only; one that is wrongly
+called in the air spoils the fit, since its leg then carries a force that the model does
+not know. So a first fit calls all feet standing, and tells how much torque each leg
+lacks: much where the foot stands, hardly any where it is in the air.
+"""
+
+import dataclasses
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxid.dynamics.base import BaseParameters
+from jaxid.identification.estimators import ResidualVariances, WeightedLeastSquares
+from jaxid.identification.problem import RegressionProblem
+from jaxid.measurement.filters import AbstractFilter, Subsample
+from jaxid.measurement.floating_base import (
+    all_standing,
+    base_of,
+    contact_grid,
+    feet_normal,
+    measured_vertical,
+)
+from jaxid.measurement.observations import observe
+from jaxid.measurement.recording import Recording
+from jaxid.robot.contacts import legs_of
+from jaxid.robot.robot import Robot
+
+STEP = 10
+"""Samples for each row of the first fit."""
+
+
+class ContactLimits(NamedTuple):
+    """Limits of what flags and an IMU may say.
+
+    In simulated logs of a quadruped a leg in the air lacks less than a tenth of the
+    torque that it lacks while it stands.
+    """
+
+    load: float = 0.3  # torque that a leg in the air may lack, over that of standing
+    duration: float = 0.2  # shortest stretch that is judged [s]
+    gravity: float = 0.05  # deviation of the mean acceleration, relative
+    tilt: float = 15.0  # between the vertical and the normal of the feet's plane [deg]
+
+
+LIMITS = ContactLimits()
+STANDARD_GRAVITY = 9.81
+"""Acceleration of gravity [m/s²]."""
+
+
+class CheckedContacts(NamedTuple):
+    """Recording whose flags may be corrected, and what was found, as sentences."""
+
+    recording: Recording
+    findings: tuple[str, ...]
+
+
+def check_contacts(
+    base: BaseParameters, recording: Recording, filter: AbstractFilter
+) -> CheckedContacts:
+    """Return a recording in which loaded legs stand, and what its flags hide.
+
+    Args:
+        base: Base parameters of the robot, which has contacts.
+        recording: Log of the robot.
+        filter: Filter of the log.
+
+    Raises:
+        InputError: If the recording lacks signals of the base.
+    """
+    robot = base.model.robot
+    findings = [*_frame_findings(robot, recording), *_constant_flags(robot, recording)]
+    missing = _missing_torques(base, recording, filter)
+    signals = base_of(recording, robot)
+    stands = signals.stands.copy()
+    sizes = [
+        np.sqrt(np.mean(torque[is_standing] ** 2)) if is_standing.any() else 0.0
+        for torque, is_standing in zip(missing.T, stands.T, strict=True)
+    ]
+    # A leg that never stands is compared with the others.
+    usual_sizes = np.where(np.array(sizes) > 0.0, sizes, max(sizes, default=0.0))
+    min_samples = LIMITS.duration / recording.sample_time
+    for a, b in contact_grid(recording, robot).segments:
+        if b - a < min_samples:
+            continue
+        loads = np.sqrt(np.mean(missing[a:b] ** 2, axis=0))
+        is_loaded = loads > LIMITS.load * usual_sizes
+        for foot in np.flatnonzero(~signals.stands[a] & is_loaded).tolist():
+            start, stop = _stretch(signals.stands[:, foot], a)
+            stands[start:stop, foot] = True
+            findings.append(
+                f"`{robot.contacts[foot].name}` is called in the air from "
+                f"{recording.time[start]:.1f} s to {recording.time[stop - 1]:.1f} s, "
+                f"but its leg carries {100 * loads[foot] / usual_sizes[foot]:.0f} % of "
+                "the load of its other stances: it counts as standing; check "
+                "`recording.contact`."
+            )
+    signals = dataclasses.replace(signals, contacts=stands.astype(float))
+    checked_recording = dataclasses.replace(recording, base=signals)
+    return CheckedContacts(checked_recording, tuple(dict.fromkeys(findings)))
+
+
+def _stretch(stands: np.ndarray, sample: int) -> tuple[int, int]:
+    """Return the samples around one in which a foot is in the air."""
+    earlier = np.flatnonzero(stands[:sample])
+    later = np.flatnonzero(stands[sample:])
+    start = int(earlier[-1]) + 1 if earlier.size else 0
+    stop = sample + int(later[0]) if later.size else len(stands)
+    return start, stop
+
+
+def _missing_torques(
+    base: BaseParameters, recording: Recording, filter: AbstractFilter
+) -> np.ndarray:
+    """Return the torque that each leg lacks if its foot is in the air [N m]."""
+    robot = base.model.robot
+    log = all_standing(recording, robot)
+    rows = RegressionProblem(base, [observe(log, robot, filter, Subsample(STEP))])
+    parameters = WeightedLeastSquares(ResidualVariances())(rows).parameters
+    observations = rows.recordings[0]
+    motion = observations.motion[::STEP]
+    # Legs feel what moves them, whatever stands.
+    predicted = base.forces_in_numpy(parameters, motion)
+    differences = predicted - np.asarray(observations.forces)[::STEP]
+    torques = []
+    for joints in legs_of(robot).own_joints:
+        torques.append(np.linalg.norm(differences[:, list(joints)], axis=1))
+    times = observations.time[::STEP]
+    return np.stack(
+        [np.interp(np.asarray(recording.time), times, torque) for torque in torques],
+        axis=1,
+    )
+
+
+def _constant_flags(robot: Robot, recording: Recording) -> list[str]:
+    """Return findings on flags that never change."""
+    stands = base_of(recording, robot).stands
+    names = [contact.name for contact in robot.contacts]
+    if stands.all():
+        return [
+            "all feet stand in the whole log: what a leg feels in the air is unknown, "
+            "so that inertias of the legs, their friction and rotors are not told "
+            "apart; lift one foot after another."
+        ]
+    never = [names[foot] for foot in np.flatnonzero(~stands.any(axis=0))]
+    if never:
+        return [
+            f"`{'`, `'.join(never)}` never stands in this log: check "
+            "`recording.contact`."
+        ]
+    return []
+
+
+def _frame_findings(robot: Robot, recording: Recording) -> list[str]:
+    """Return findings on the IMU: its unit, and its frame by gravity."""
+    signals = base_of(recording, robot)
+    up, gravity = measured_vertical(recording, robot)
+    findings = []
+    if abs(gravity / STANDARD_GRAVITY - 1.0) > LIMITS.gravity:
+        findings.append(
+            f"the accelerometer measures {gravity:.3g} m/s² on average, but gravity is "
+            f"{STANDARD_GRAVITY} m/s²: check `accelerometer_unit`, and that gravity is "
+            "not subtracted."
+        )
+    normal = feet_normal(recording, robot)
+    if normal is not None:
+        cosine = np.median(np.sum(normal * up[signals.stands.all(axis=1)], axis=1))
+        tilt = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
+        if tilt > LIMITS.tilt:
+            findings.append(
+                f"gravity as the accelerometer measures it is tilted by {tilt:.0f} "
+                "degrees against the plane of the feet while all stand: the IMU has "
+                "another frame (`robot.imu`), or the ground is steep."
+            )
+    return findings
