@@ -42,6 +42,11 @@ def base_of(recording: Recording, robot: Robot) -> BaseSignals:
             f"`{recording.name}` has no signals of an IMU, which a floating base "
             "needs: name the columns `gyro`, `accelerometer` and `contact`."
         )
+    if recording.forces is None:
+        raise InputError(
+            f"`{recording.name}` has no forces, which a floating base needs: name "
+            "their columns (`forces`)."
+        )
     if signals.contacts.shape[1] != len(robot.contacts):
         names = ", ".join(contact.name for contact in robot.contacts)
         raise InputError(
@@ -74,8 +79,9 @@ def floating_samples(
 ) -> SamplesInMemory:
     """Return motion and forces, without those of contacts, of some stretches."""
     signals = base_of(recording, robot)
+    measured_forces = np.asarray(recording.forces)
     q, qd, forces = joint_side(
-        robot, recording, recording.angles, recording.velocities, recording.forces
+        robot, recording, recording.angles, recording.velocities, measured_forces
     )
     parts = []
     for a, b in recording.segments:
@@ -232,7 +238,8 @@ def feet_normal(recording: Recording, robot: Robot) -> np.ndarray | None:
     stands = base_of(recording, robot).stands.all(axis=1)
     if len(robot.contacts) < 3 or not stands.any():
         return None
-    q, _, _ = joint_side(robot, recording, recording.angles, None, recording.forces)
+    measured_forces = np.asarray(recording.forces)
+    q, _, _ = joint_side(robot, recording, recording.angles, None, measured_forces)
     angles = np.zeros((np.count_nonzero(stands), robot.joints))
     angles[:, list(robot.driven)] = q[stands]
     points = []
