@@ -95,7 +95,7 @@ def real_rows() -> list[Row]:
         by_session = " ".join(f"{x:.2f}" for x in means)
         rows.append(
             Row(
-                "44",
+                "",
                 f"{name}, sessions held out in turn, every pose, mean distance [mm]",
                 "`calibration real`",
                 f"<= {asked}",
@@ -109,7 +109,7 @@ def real_rows() -> list[Row]:
         said = any("known distance" in str(x.text) for x in fit.findings)
         rows.append(
             Row(
-                "44",
+                "",
                 f"{name}, distance of the sockets (50 mm) in sessions held out",
                 "`calibration real`",
                 "within its interval, or said",
@@ -121,7 +121,7 @@ def real_rows() -> list[Row]:
     mean = np.mean(all_means)
     rows.append(
         Row(
-            "44",
+            "",
             f"mean of {len(all_means)} sessions held out [mm]",
             "`calibration real`",
             "<= 0.32",
@@ -153,7 +153,7 @@ def halves_rows() -> list[Row]:
     share_of_poses = 100 * np.mean(inside_of_poses)
     return [
         Row(
-            "44",
+            "",
             "halves of the sessions, Panda 2, 35 splits: differences inside the 95 % "
             "interval",
             "`calibration halves`",
@@ -204,7 +204,7 @@ def fr3_rows() -> list[Row]:
         words.append(f"{length:.2f} mm, {angle:.3f} degrees")
     return [
         Row(
-            "44",
+            "",
             "FR3, 114 camera poses, ten folds of poses held out in turn",
             "`calibration fr3`",
             "<= 1.25 mm, <= 0.19 degrees",
@@ -297,7 +297,7 @@ def simulated_rows(draws: int) -> list[Row]:
     coverage = 100 * np.mean(inside)
     return [
         Row(
-            "44",
+            "",
             f"simulated, {draws} draws, {len(inside[0])} combinations of "
             f"{len(truth)} unknowns: coverage of the 95 % intervals",
             "`calibration simulated`",
@@ -306,7 +306,7 @@ def simulated_rows(draws: int) -> list[Row]:
             93 <= coverage <= 97,
         ),
         Row(
-            "44",
+            "",
             "combinations that the data cannot tell, against the null space of "
             "differences in NumPy",
             "`calibration simulated`",
@@ -388,7 +388,7 @@ def time_rows() -> list[Row]:
     wall, processor = cost(lambda: calibrate(arm, sessions))
     rows = [
         Row(
-            "44",
+            "",
             "Panda 2: wrong poses, prior and geometry of 496 poses in eight sessions, "
             "warm",
             "`calibration time`",
@@ -400,7 +400,7 @@ def time_rows() -> list[Row]:
     wall, processor = cost(lambda: fit.bootstrap(1000))
     rows.append(
         Row(
-            "44",
+            "",
             "1,000 bootstrap calibrations (one Gauss-Newton step each)",
             "`calibration time`",
             "<= 20 s",
@@ -474,7 +474,7 @@ def scipy_row(arm: Arm, fit) -> Row:
     own_cost = 0.5 * np.sum(residuals(estimate) ** 2)
     ratio = np.median(ratios)
     return Row(
-        "44",
+        "",
         "the search against scipy's `least_squares` with differences, vectorised "
         f"errors in NumPy, {len(start)} unknowns of Panda 2; CPU time",
         "`calibration time`",

@@ -11,6 +11,7 @@ from jaxid.arrays import AnyArray, Texts, Vector, double_precision
 from jaxid.errors import InputError
 from jaxid.identification.run_to_run import Run
 from jaxid.identification.uncertainty import Uncertainty
+from jaxid.identification.uncertainty.result import dof_of_sum
 from jaxid.result_table import Remark, Summarised, Table
 from jaxid.robot.robot import Robot
 
@@ -256,8 +257,14 @@ class GeometryFit(Summarised):
             other: Calibration with the same nominal robot and kinds of observations.
 
         Raises:
-            InputError: If the corrections of the other are not the same.
+            InputError: If the corrections of the other are not the same, or one of both
+                has a single session.
         """
+        if min(self.dof, other.dof) < 1:
+            raise InputError(
+                "both calibrations need at least two sessions, whose scatter tells how "
+                "sure they are: record more."
+            )
         if other.corrections != self.corrections:
             raise InputError(
                 "`other` must be a calibration of the same robot with the same tools, "
@@ -272,10 +279,13 @@ class GeometryFit(Summarised):
             for row, leader in enumerate(combinations.leaders)
             if self.is_determined[row] and other_flags.get(leader, False)
         ]
-        scatter = self.covariances.scatter + other.covariances.scatter
-        variances = np.diag(combinations.covariance(scatter))
-        quantile = scipy.special.stdtrit(max(min(self.dof, other.dof), 1), 0.975)
-        half_widths = quantile * np.sqrt(variances)
+        own_variances, other_variances = (
+            np.diag(combinations.covariance(fit.covariances.scatter))
+            for fit in (self, other)
+        )
+        dof = dof_of_sum(own_variances, other_variances, self.dof, other.dof)
+        quantiles = scipy.special.stdtrit(dof, 0.975)
+        half_widths = quantiles * np.sqrt(own_variances + other_variances)
         corrections = [self.corrections[combinations.leaders[row]] for row in rows]
         return GeometryChange(
             tuple(correction.words for correction in corrections),
