@@ -190,6 +190,8 @@ plt.show()
 # * `robot.close(y)` gives the coordinates of all joints, on the branch of the file's pose.
 # * Base parameters, intervals and predictions work as for any other robot.
 #
+# Next: [the true geometry](13_calibration.ipynb).
+#
 # ## Exercise
 #
 # Give `b1` a range in which the arms become straight, and look at what `robot.close` says.
