@@ -112,7 +112,7 @@ plt.show()
 # * Bias and mounting are unknowns beside the load. Gravity tells both, if the log has many attitudes.
 # * `jid.export_c(fit, ...)` writes the wrench of load and bias as C: what is measured beyond it is contact.
 #
-# Details: [force sensors](../docs/force_sensors.md).
+# Details: [force sensors](../docs/force_sensors.md). Next: [a closed chain](12_closed_chain.ipynb).
 #
 # ## Exercise
 #
