@@ -74,5 +74,5 @@ class Result(NamedTuple):
 
     # Forces [samples, joints] of a motion (q, qd, qdd), each [samples, joints].
     forces: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
-    # Ten parameters of each body (m, m c, A, B, C, D, E, F), if the method gives bodies.
+    # Ten parameters of each body (m, m c, A, B, C, D, E, F), if there are any.
     bodies: np.ndarray | None = None
