@@ -107,8 +107,12 @@ def picture(results):
 
 
 def write(results, lines):
-    """Write the page, the picture and the JSON."""
+    """Write the page, the picture and the JSON; pairs that were not run stay."""
     date = datetime.date.today().isoformat()
+    if RESULTS.exists():
+        earlier = json.loads(RESULTS.read_text(encoding="utf-8"))["results"]
+        names = dict.fromkeys([*earlier, *results])
+        results = {x: earlier.get(x, {}) | results.get(x, {}) for x in names}
     content = {"date": date, "results": results, "lines": lines}
     RESULTS.write_text(json.dumps(content, indent=1), encoding="utf-8")
     picture(results)
