@@ -293,10 +293,7 @@ class Study:
     def __init__(self, robot: Legged, log: dict[str, Any], other: dict[str, Any]):
         self.robot, self.log = robot, log
         self.described = robot.load()
-        rng = np.random.default_rng(100)
-        first = self.observe(recording(log, rng))
-        base = jid.base_parameters(jid.Model(self.described))
-        self.base = jid.identify_transition_speeds(base, [first])
+        self.base = jid.base_parameters(jid.Model(self.described))
         self.truth = self.base.from_standard(robot.truth(self.base.model))
         total = np.zeros(self.base.model.size)
         total[: 10 * len(self.described.solid_bodies) : 10] = 1.0
