@@ -1,9 +1,9 @@
-"""Robots on legs, simulated by MuJoCo: what their logs determine, and how well.
+"""A robot on legs, simulated by MuJoCo: what its logs determine, and how well.
 
-A quadruped (Go2) and a humanoid (G1), of example-robot-data, stand on MuJoCo's ground.
-Controllers of joint angles move the base, and lift one foot after another. The logs
-hold angles, torques, gyroscope, accelerometer, and whether each foot touches the
-ground: no attitude, no velocity of the base, and no contact force.
+A quadruped (Go2 of example-robot-data) stands on MuJoCo's ground. Controllers of its
+joint angles move the base, and lift one foot after another. The logs hold angles,
+torques, gyroscope, accelerometer, and whether each foot touches the ground: no
+attitude, no velocity of the base, and no contact force.
 
     python benchmarks/floating.py               # some minutes
     python benchmarks/floating.py --quick
@@ -69,20 +69,6 @@ GO2 = Legged(
     "go2_description/urdf/go2.urdf",
     {f"{leg}_foot": jid.Sphere(0.022) for leg in ("FL", "FR", "RL", "RR")},
     {"hip": 0.0, "thigh": 0.8, "calf": -1.6},
-)
-G1 = Legged(
-    "g1_description/urdf/g1_29dof_rev_1_0.urdf",
-    {f"{side}_ankle_roll_link": jid.Sole() for side in ("left", "right")},
-    {"hip_pitch": -0.5, "knee": 1.0, "ankle_pitch": -0.5, "elbow": 0.6},
-    armature=0.02,
-    damping=0.3,
-    friction=0.3,
-    stiffness=600.0,
-    rate_gain=12.0,
-    torque=150.0,
-    sway=(0.004, 0.004, 0.008, 0.02, 0.02, 0.04),
-    shift=(0.0, 0.105),
-    sole=(0.09, 0.035, 0.01),
 )
 
 

@@ -75,6 +75,7 @@ METHODS = (
     Script("rollout", 55),
     Script("calibration", 6),
     Script("force_sensor", 10),
+    Script("floating", 10),
     Script("transients", 1),
     Script("excitation", 60),
     Script("safe_motions", 40),
