@@ -18,7 +18,8 @@ from .solution import solve
 
 NO_MASSES = (
     "Compliance was left out, because the masses of the robot are not known: give "
-    "`bodies`, for which rough masses suffice (`jid.calibration.rough_bodies`)"
+    "rough ones (`masses` in the experiment file, `jid.calibration.rough_bodies` in "
+    "Python)"
 )
 
 
@@ -45,8 +46,8 @@ def calibrate(
         compliance: Whether joints deflect under gravity.
 
     Raises:
-        InputError: If there is no observation, coordinates do not fit the robot, or it
-            has closed loops.
+        InputError: If there is no observation, or they are too few; if coordinates do
+            not fit the robot, or it has closed loops.
     """
     if robot.loops:
         raise InputError(
@@ -63,6 +64,8 @@ def calibrate(
                 f"{robot.joints} columns, one for each joint of `{robot.name}`, but "
                 f"has {joints}."
             )
+        if observation.has_poses:
+            require_radians(robot, observation)
     parameters = None
     if compliance:
         parameters = _bodies_of_file(robot) if bodies is None else bodies
@@ -71,11 +74,35 @@ def calibrate(
         as_finite_array("`bodies`", numbers, (robot.bodies, 10))
         parameters = numbers
     problem = build_problem(robot, observations, parameters)
+    numbers_measured = len(problem.row_deviations)
+    numbers_unknown = np.count_nonzero(problem.freedoms)
+    if numbers_measured <= numbers_unknown:
+        raise InputError(
+            f"`observations` must hold more than the {numbers_unknown} unknown numbers "
+            f"of tools and places, but hold {numbers_measured}: record 20 to 30 poses "
+            "in each place."
+        )
     notes = (NO_MASSES,) if compliance and parameters is None else ()
     session_weights = np.ones(len(problem.sessions))
     has_compliance = parameters is not None
     solution = solve(problem, session_weights, has_compliance)
     return GeometryFit(problem, solution, has_compliance, notes)
+
+
+def require_radians(robot: Robot, observation: AbstractObservation) -> None:
+    """Reject angles that are more than a turn outside the range of their joint."""
+    limits = robot.limits
+    below = limits.position_min - observation.q
+    above = observation.q - limits.position_max
+    excess = np.where(robot.revolute, np.maximum(below, above), 0.0)
+    pose, joint = np.unravel_index(np.argmax(excess), excess.shape)
+    if excess[pose, joint] > 2.0 * np.pi:
+        raise InputError(
+            f"`q` of the session `{observation.session}` must hold joint angles in "
+            f"radians, but joint {joint + 1} is at {observation.q[pose, joint]:.4g}, "
+            f"more than a turn outside its range: are angles in degrees "
+            '(`angle_unit = "deg"` in the experiment file), or columns wrong?'
+        )
 
 
 def _bodies_of_file(robot: Robot) -> BodyParameters | None:
@@ -102,7 +129,8 @@ def rough_bodies(robot: Robot, masses: Numbers) -> BodyParameters:
     Raises:
         InputError: If there is not one mass for each body.
     """
-    body_masses = as_finite_array("`masses`", np.asarray(masses), (robot.bodies,))
+    what = f"`masses`, one for each body of `{robot.name}`,"
+    body_masses = as_finite_array(what, np.asarray(masses), (robot.bodies,))
     ends = np.zeros((robot.bodies, 3))
     for body, parent in enumerate(robot.parent):
         if parent >= 0:

@@ -59,8 +59,10 @@ def _verdict(fit: "GeometryFit", findings: list[Remark]) -> Remark:
         )
         return Remark(text, Status.BAD)
     text = f"On sessions held out in turn, the mean error falls {numbers}"
-    if worst in (Status.BAD, Status.DOUBTFUL):
-        text += "; look at what is marked before you use the geometry"
+    if worst is Status.BAD:
+        text += ", but do not use the geometry: first correct what is marked ✗"
+    if worst is Status.DOUBTFUL:
+        text += "; look at what is marked ! before you use the geometry"
     return Remark(text, worst)
 
 

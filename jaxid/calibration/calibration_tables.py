@@ -54,13 +54,14 @@ def session_table(fit: "GeometryFit") -> Table:
         if np.isfinite(errors.angles).any():
             angles = [np.rad2deg(np.nanmean(errors.angles[x])) for x in poses]
             columns.append(Column(words, angles, "deg"))
+    remark = (
+        "Held out: the calibration has not seen the session; all poses count, also "
+        "those that it leaves out as wrong."
+    )
     return Table(
         "mean errors of the poses of each session",
         *columns,
-        remarks=[
-            "Held out: the calibration has not seen the session; all poses count, also "
-            "those that it leaves out as wrong."
-        ],
+        remarks=[remark] if fit.can_hold_out else [],
     )
 
 
@@ -117,7 +118,10 @@ def combination_table(fit: "GeometryFit") -> Table:
             ),
         ],
         status=[Status.GOOD if x else Status.NEUTRAL for x in is_determined],
-        remarks=["✓ the poses tell more than the prior; · the prior decides."],
+        remarks=[
+            "In the table of combinations, ✓ means that the poses tell more than the "
+            "prior, and · that the prior decides."
+        ],
     )
 
 

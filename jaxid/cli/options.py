@@ -189,9 +189,12 @@ def require_experiment_first(experiment: Path, logs: Sequence[Path]) -> None:
     """Reject a log, or a robot's file, in the place of the experiment file."""
     suffix = experiment.suffix.lower()
     is_swapped = any(log.suffix.lower() == ".toml" for log in logs)
-    if suffix in TEXT_SUFFIXES or (is_swapped and suffix != ".toml"):
+    is_log = suffix in TEXT_SUFFIXES or experiment.is_dir()
+    if is_log or (is_swapped and suffix != ".toml"):
+        kind = "folder" if experiment.is_dir() else "log"
         raise InputError(
-            f"`{experiment}` is a log; the experiment file comes first, then the logs."
+            f"`{experiment}` is a {kind}; the experiment file comes first, then the "
+            "logs."
         )
     if suffix in ROBOT_SUFFIXES:
         raise InputError(

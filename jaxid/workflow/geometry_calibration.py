@@ -112,6 +112,8 @@ def calibrate_from_files(
     from jaxid.report.calibration_report import calibration_report
 
     files = list(session_files([Path(path) for path in paths]))
+    if len({file.path.resolve() for file in files}) < len(files):
+        raise InputError("`sessions` must be different, but some are given twice.")
     progress("reading the sessions", 0.0)
     observations = read_observations(setup, files, settings)
     bodies = None
@@ -161,7 +163,12 @@ def read_observations(
     observations: list[Any] = []
     places: dict[str, list[str]] = {}
     for file in files:
-        q, measurements = _read(setup, file.path, settings)
+        try:
+            q, measurements = _read(setup, file.path, settings)
+        except InputError as error:
+            # Sessions have files of the same names.
+            owner = f"session `{file.session}`, {setup.robot.joints} joints"
+            raise InputError(f"{owner}: {error}") from None
         fields = {
             **measurements,
             "place": file.place,

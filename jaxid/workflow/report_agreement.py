@@ -31,6 +31,17 @@ def agree_reports(reports: Sequence[Path]) -> RunsReport:
         InputError: If there are fewer than two, a folder holds no such result, or the
             parameters of two differ.
     """
+    if len({path.resolve() for path in reports}) < max(2, len(reports)):
+        raise InputError(
+            "`reports` must be two or more different folders, but are: "
+            f"{', '.join(map(str, reports))}."
+        )
+    result_files = [result_file(path) for path in reports]
+    if len(set(result_files)) > 1:
+        raise InputError(
+            "`reports` must be written by one command, but their results are "
+            f"{', '.join(f'`{x}`' for x in dict.fromkeys(result_files))}."
+        )
     short_names = [path.name for path in reports]
     has_short_names = len(set(short_names)) == len(reports)
     names = short_names if has_short_names else [str(path) for path in reports]
@@ -68,23 +79,36 @@ def pooled_rows(result: Agreement) -> list[Record]:
     )
 
 
-def read_run(report: Path, name: str) -> Fit | Run:
-    """Return the result that a report holds, under a name."""
-    for file in RESULT_FILES:
+def result_file(report: Path) -> str:
+    """Return the name of the file that holds the result of a report."""
+    for file in (*RESULT_FILES, MODEL):
         if (report / file).is_file():
-            return _run_of_rows(name, read_json(report / file)["parameters"])
-    if report.is_dir() and not (report / MODEL).is_file():
+            return file
+    if report.is_dir():
         raise InputError(
             f"`{report}` must be a folder of `jaxid identify`, `rollout` or "
             f"`calibrate`, but holds neither `{MODEL}` nor "
             f"`{'` nor `'.join(RESULT_FILES)}`."
         )
+    return MODEL
+
+
+def read_run(report: Path, name: str) -> Fit | Run:
+    """Return the result that a report holds, under a name."""
+    file = result_file(report)
+    if file in RESULT_FILES:
+        return _run_of_rows(name, read_json(report / file)["parameters"])
     return dataclasses.replace(read_fit(report), name=name)
 
 
 def _run_of_rows(name: str, rows: Sequence[Record]) -> Run:
     """Return the estimates of a result file, by their own deviations."""
     deviations = np.array([row["standard_deviation"] for row in rows], float)
+    if not np.isfinite(deviations).all():
+        raise InputError(
+            f"`{name}` must have intervals, but has none: calibrate with at least two "
+            "sessions."
+        )
     # Not all parameters belong to a joint.
     joints = [f" ({row['joint']})" if "joint" in row else "" for row in rows]
     return Run(

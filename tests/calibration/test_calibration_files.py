@@ -188,3 +188,34 @@ def test_two_reports_can_be_compared(report, tmp_path):
     other = shutil.copytree(report, tmp_path / "other")
     agreement = jid.workflow.agree_reports([report, other])
     assert not agreement.content["odd_runs"]
+
+
+def test_reports_that_cannot_be_compared_are_refused(report, tmp_path):
+    other = shutil.copytree(report, tmp_path / "other")
+    with pytest.raises(jid.InputError, match="different folders"):
+        jid.workflow.agree_reports([report, report.parent / "." / report.name])
+    content = json.loads((other / "calibration.json").read_text())
+    # One session alone has no intervals.
+    for row in content["parameters"]:
+        row["standard_deviation"] = None
+    (other / "calibration.json").write_text(json.dumps(content))
+    with pytest.raises(jid.InputError, match="`other` must have intervals"):
+        jid.workflow.agree_reports([report, other])
+    (other / "calibration.json").rename(other / "rollout.json")
+    with pytest.raises(jid.InputError, match="one command"):
+        jid.workflow.agree_reports([report, other])
+
+
+def test_files_of_sessions_are_named_in_refusals(folder, tmp_path):
+    sessions = shutil.copytree(folder / "sessions", tmp_path / "sessions")
+    (sessions / "day 2" / "tracker.csv").write_text("q1,q2\n1.0,2.0\n")
+    output = tmp_path / "refused"
+    words = ["calibrate", folder / "experiment.toml"]
+    result = run(*words, sessions, "-o", output)
+    assert "session `day 2`" in str(result.exception)
+    twice = [folder / "sessions", folder / "sessions"]
+    result = run(*words, *twice, "-o", output)
+    assert "given twice" in str(result.exception)
+    result = run("calibrate", sessions, sessions, "-o", output)
+    assert "is a folder; the experiment file comes first" in str(result.exception)
+    assert not output.exists()

@@ -192,3 +192,11 @@ def test_wrong_calibrations_are_refused(robot):
         jid.calibrate(
             robot, [c.PointContact("s", np.zeros((3, 7)))], bodies=np.ones(20)
         )
+    degrees = np.linspace(np.zeros(7), np.full(7, -60.0), 9)
+    with pytest.raises(jid.InputError, match="radians"):
+        jid.calibrate(robot, [c.PointContact("s", degrees)])
+    # Two places of one pose each: 7 numbers for 9 unknown ones.
+    few = [c.PointContact("s", np.zeros((1, 7)), place=place) for place in "ab"]
+    distance = c.SocketDistance("s", place="a", other_place="b", distance=0.05)
+    with pytest.raises(jid.InputError, match="`observations`"):
+        jid.calibrate(robot, [*few, distance])
