@@ -131,7 +131,7 @@ def relative_motions(robot: Robot, q: Joints, qd: Joints) -> list[RelativeMotion
 
 
 def _free_body(p: AnyArray, w: Vector3) -> ArticulatedBody:
-    """Return a body whose joints are all free (Eq. 10)."""
+    """Return a body whose joints are all free."""
     h = p[1:4]
     J = inertia_tensor(p[4:])
     force = jnp.cross(w, jnp.cross(w, h))

@@ -41,6 +41,7 @@ def fit_capsules(
     base_rotation: Numbers | None = None,
     base_position: Numbers = ORIGIN,
     xacro_arguments: Mapping[str, str] | None = None,
+    floating: bool = False,
     packages: str | Path | None = None,
     faults: dict[str, UnreadShapes] | None = None,
 ) -> tuple[Capsule, ...]:
@@ -61,6 +62,7 @@ def fit_capsules(
         base_rotation: As in `load_urdf`.
         base_position: As in `load_urdf` [m].
         xacro_arguments: As in `load_urdf`.
+        floating: As in `load_urdf`.
         packages: Folder that holds the packages of `package://` paths. If None, they
             are searched in the folders above the file.
         faults: Dictionary for the links whose geometry cannot be read; if None, that is
@@ -70,7 +72,9 @@ def fit_capsules(
         FileNotFoundError: If the file or a mesh does not exist.
         InputError: If the file cannot be loaded, or its geometry cannot be read.
     """
-    tree = UrdfTree(path, base=base, tip=tip, xacro_arguments=xacro_arguments)
+    tree = UrdfTree(
+        path, base=base, tip=tip, xacro_arguments=xacro_arguments, floating=floating
+    )
     mount = np.eye(3) if base_rotation is None else np.array(base_rotation, np.float64)
     place = np.array(base_position, np.float64)
 
