@@ -60,7 +60,7 @@ class Excitation:
         ros: Kind of the file for ROS 2: "yaml" or "mcap" (a bag).
         nominal: Folder of an earlier result of `jaxid identify`, whose parameters are
             used to compute forces, like `"report"`.
-        force_margin: float of the largest forces to keep free, by nominal parameters,
+        force_margin: Share of the largest forces to keep free, by nominal parameters,
             like `0.1`; by default 0.3 if friction or other parameters are unknown, else
             0.
         tip_speed: Largest speed of the end-effector [m/s], like `1.5`.

@@ -109,7 +109,7 @@ class LogReading:
         largest_gap: Longest gap that is interpolated, in sample times; gaps up to a
             tenth of the period of the filter's cut-off frequency are always
             interpolated.
-        bad_rows: float of the rows that may be bad, and are left out.
+        bad_rows: Share of the rows that may be bad, and are left out.
         start: Start of the part of every log that is used [s], like `0.0`.
         stop: End of that part [s], like `10.0`.
     """
