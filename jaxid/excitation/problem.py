@@ -15,6 +15,7 @@ from jaxid.arrays import (
 )
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.packed_regressor import JointRegressor
 from jaxid.errors import InputError
 from jaxid.robot.joint_coordinates import reachable
 from jaxid.robot.limits_and_drives import Limits
@@ -120,7 +121,9 @@ class ExcitationProblem:
                 f"for each joint, but is {self.noise}."
             )
         self.weights = 1.0 / self.noise
-        self.regressor = base.joint_regressor
+        # From the coordinates of the motors: the program closes the loops.
+        _, *shapes = base.model.input_shapes
+        self.regressor = JointRegressor(base, base.columns, (robot.joints,), *shapes)
         instants = self.basis.instants(CHECKED_INSTANTS)
         self.checked_rows = np.asarray(self.basis.rows(instants)[:3])
         self._sample_rows: dict[int, np.ndarray] = {}
