@@ -621,3 +621,35 @@ def test_a_controller_gets_no_motion_that_starts_at_full_speed(written, monkeypa
     experiment = load_experiment(with_keys(written, "jump.toml", *keys, text=FREE))
     with pytest.raises(InputError, match="`controller`"):
         task_of(experiment)
+
+
+SLIDER = """<mujoco model="slider"><compiler angle="radian"/><worldbody>
+<body name="crank"><joint name="crank" axis="0 -1 0" range="-1.5 2.5"/>
+<inertial pos=".06 0 .01" mass="1.1" diaginertia=".002 .004 .004"/>
+<body name="rod" pos=".1 0 0"><joint name="rod" axis="0 -1 0"/>
+<inertial pos=".2 0 0" mass=".7" diaginertia=".001 .01 .01"/>
+<site name="a" pos=".4 0 0"/></body></body>
+<body name="piston"><joint name="piston" type="slide" axis="1 0 0" range=".35 .48"/>
+<inertial pos="0 0 0" mass="2" diaginertia=".003 .003 .003"/><site name="b"/></body>
+</worldbody><equality><connect name="pin" site1="a" site2="b"/></equality>
+<actuator><motor joint="crank" ctrlrange="-8 8"/></actuator>
+<keyframe><key qpos="0.9273 -1.1287 0.451918"/></keyframe></mujoco>"""
+
+
+def test_a_closed_loop_keeps_its_limits_on_the_whole_way_and_it_is_said(tmp_path, run):
+    (tmp_path / "slider.xml").write_text(SLIDER)
+    file = tmp_path / "experiment.toml"
+    settings = "leads = true\nharmonics = 2\nstarts = 2\ngenerations = 1\n"
+    file.write_text(
+        '[robot]\nmjcf = "slider.xml"\n[collision]\nfit = false\nfloor = false\n'
+        f"[excitation]\n{settings}"
+    )
+    code, out, error = run("excite", file, "-o", tmp_path / "t.csv")
+    assert code == 3, error
+    assert "✓ closed loops: 4 of 4 limits are kept" in " ".join(out.split())
+    table = np.genfromtxt(tmp_path / "t.csv", delimiter=",", skip_header=1)
+    crank = table[:, 1]
+    assert np.ptp(crank) > 0.5
+    piston = 0.1 * np.cos(crank) + np.sqrt(0.16 - (0.1 * np.sin(crank)) ** 2)
+    assert piston.min() >= 0.35 - 1e-6
+    assert piston.max() <= 0.48 + 1e-6

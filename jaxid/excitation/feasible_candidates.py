@@ -86,8 +86,11 @@ class Candidates(NamedTuple):
         pairs = zip(self, others, strict=True)
         all_motions = Candidates(*(xp.concatenate(pair) for pair in pairs))
         sorted_motions = all_motions.at(all_motions.order())
-        value_steps = xp.diff(sorted_motions.value, prepend=np.nan)
-        violation_steps = xp.diff(sorted_motions.violation, prepend=np.nan)
+        # Infinite where motions determine too little, or are far beyond a limit: these
+        # are no duplicates.
+        with np.errstate(invalid="ignore"):
+            value_steps = xp.diff(sorted_motions.value, prepend=np.nan)
+            violation_steps = xp.diff(sorted_motions.violation, prepend=np.nan)
         is_duplicate = (value_steps <= SAME_VALUE) & (violation_steps == 0.0)
         order = xp.lexsort((is_duplicate,))
         return sorted_motions.at(order[: len(self.value)])

@@ -23,6 +23,11 @@ def refuse_missing_wrench(recording: Recording, robot: Robot) -> None:
             "columns, or describe the sensor by `robot.with_sensor()`; of the commands "
             "only `jaxid payload` uses `[sensor]`."
         )
+    if wrench is not None and columns and not np.ptp(wrench, axis=0).any():
+        raise InputError(
+            f"all columns of `wrench` of `{recording.name}` are constant: the driver "
+            "measures nothing; switch the sensor on, or name other columns."
+        )
 
 
 def on_all_joints(

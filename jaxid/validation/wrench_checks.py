@@ -35,6 +35,7 @@ class WrenchLimits(NamedTuple):
     max_angle: float = np.deg2rad(10.0)  # of a mounting that is not described
     absent: float = 0.25  # gravity over inertia below which it is taken out
     tared: float = 0.1  # force at the start over gravity of the load
+    min_mass: float = 0.02  # of a load that gravity tells clearly [kg]
 
 
 LIMITS = WrenchLimits()
@@ -116,7 +117,7 @@ def _lacks_gravity(forces: Forces, gravity: Forces, inertia: Forces) -> bool:
 
 
 def _axes_remarks(robot: Robot, gravity: _Gravity) -> list[Remark]:
-    """Return that the wrench has another sign, or is along other axes."""
+    """Return that the wrench has another unit or sign, or is along other axes."""
     U, gains, Vt = np.linalg.svd(gravity.gain)
     is_clear = gains[-1] > LIMITS.min_spread * gains[0]
     if not is_clear or gravity.unexplained > LIMITS.max_unexplained:
@@ -124,6 +125,13 @@ def _axes_remarks(robot: Robot, gravity: _Gravity) -> list[Remark]:
     turn = U @ Vt
     sign = float(np.sign(np.linalg.det(turn)))
     remarks = []
+    mass = float(np.mean(gains))
+    if mass < LIMITS.min_mass:
+        text = (
+            f"gravity says that the load has only {significant(1e3 * mass, 2)} g: are "
+            "the forces in another unit, such as kN? Write N and N m into the log."
+        )
+        remarks.append(Remark(text, Status.BAD))
     if sign < 0:
         text = (
             "the wrench has the opposite sign: it is the wrench of the load on the "

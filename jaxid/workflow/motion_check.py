@@ -1,10 +1,10 @@
-"""Checks of a designed motion, a remark each: joints, floor, collision, forces."""
+"""Checks of a designed motion, a remark each: joints, loops, shapes, forces."""
 
 from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from jaxid.excitation.constraints import Finding
+from jaxid.excitation.constraints import Finding, LoopLimits
 from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.result_table import Remark, Status
 from jaxid.robot.shapes import HalfSpace
@@ -26,6 +26,7 @@ def check_motion(
         force_fault: Why forces were not checked; empty if they were.
     """
     yield check_joints(plan)
+    yield from check_loops(plan)
     floors = [x.name for x in surroundings.obstacles if isinstance(x, HalfSpace)]
     floor_findings = []
     other_findings = []
@@ -60,6 +61,16 @@ def check_joints(plan: ExcitationPlan) -> Remark:
     return Remark(
         f"{quantities}: all joints keep their limits at all times", Status.GOOD
     )
+
+
+def check_loops(plan: ExcitationPlan) -> Iterator[Remark]:
+    """Yield whether closed loops keep their limits, if the robot has loops."""
+    robot = plan.base.model.robot
+    if not robot.loops:
+        return
+    names = [entry.name for entry in LoopLimits().entries(robot)]
+    findings = [finding for finding in plan.findings if finding.name in names]
+    yield judge("closed loops", findings)
 
 
 def check_floor(

@@ -32,6 +32,7 @@ from jaxid.trajectory.files import (
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.lead_in_and_out import WithLeads, with_leads
 from jaxid.trajectory.trajectory import (
+    AbstractBasis,
     AbstractTrajectory,
     LinearTrajectory,
     PaddedToCycle,
@@ -72,6 +73,13 @@ class MotionTask(NamedTuple):
     constraints: tuple[AbstractConstraint, ...]
     force_fault: str
     begin: LinearTrajectory | None = None
+
+    @property
+    def basis(self) -> AbstractBasis:
+        """Basis of the motion, with leads where these have limits of their own."""
+        # A design adds the limits of closed loops.
+        has_constraints = bool(self.constraints or self.setup.robot.loops)
+        return self.excitation.basis(has_constraints)
 
     @property
     def faults(self) -> Texts:
@@ -163,7 +171,7 @@ def prepare_motion(
         return task
     begin = load_trajectory(earlier_design)
     begin = begin.inner if isinstance(begin, WithLeads) else begin
-    basis = excitation.basis(bool(constraints))
+    basis = task.basis
     if not (isinstance(begin, LinearTrajectory) and str(begin.basis) == str(basis)):
         raise InputError(
             f"`{earlier_design}` holds a motion of another kind: design anew."
@@ -206,7 +214,7 @@ def design_motion(
     noise = None if excitation.noise is None else np.array(excitation.noise)
     plan = design_excitation(
         setup.base,
-        basis=excitation.basis(bool(task.constraints)),
+        basis=task.basis,
         constraints=task.constraints,
         key=jax.random.key(excitation.seed),
         noise=noise,

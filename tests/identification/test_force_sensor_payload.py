@@ -93,7 +93,7 @@ def test_refusals(time):
     q = poses(time, 1.0)
     with pytest.raises(jid.InputError, match="`wrench`"):
         jid.Recording.of(q, None, sample_time=0.01)
-    for columns in (None, values[:, :3]):
+    for columns in (None, values[:, :3], 0.0 * values):
         log = jid.Recording.of(q, 0.0 * q, wrench=columns, sample_time=0.01)
         with pytest.raises(jid.InputError, match="`wrench`"):
             jid.observe(log, robot, *OPTIONS)
@@ -126,6 +126,8 @@ def test_a_wrench_that_is_not_the_one_described_is_named_by_gravity(time):
     assert findings(time, noisy(right, 0)) == []
     (reversed_sign,) = findings(time, noisy(-right, 1))
     assert "opposite sign" in reversed_sign.text
+    (unit,) = findings(time, noisy(right, 1) / 1000)
+    assert "kN" in unit.text
     quarter = Rotation.from_euler("xyz", [0, 90, 90], degrees=True)
     (turned,) = findings(time, noisy(wrench(time, turn=quarter.as_rotvec()), 2))
     assert "[0, 90, 90] degrees" in turned.text or "90" in turned.text
