@@ -96,24 +96,36 @@ class KindFactors(NamedTuple):
 
 def departure(run: Run, others: Runs) -> Departure:
     """Return the difference of a run from the mean of others."""
-    count = len(others)
     mean = np.mean([other.parameters for other in others], axis=0)
-    covariance = run.covariance + sum(o.covariance for o in others) / count**2
-    is_determined = np.isfinite(np.diag(covariance))
-    deviations = np.sqrt(np.diag(covariance)[is_determined])
-    scaled = covariance[np.ix_(is_determined, is_determined)]
-    correlation = scaled / np.outer(deviations, deviations)
+    covariance = run.covariance.copy()
+    for other in others:
+        covariance += other.covariance / len(others) ** 2
+
+    variances = np.diag(covariance)
+    is_determined = np.isfinite(variances)
+    places = np.ix_(is_determined, is_determined)
+    deviations = np.sqrt(variances[is_determined])
+    correlation = covariance[places] / np.outer(deviations, deviations)
+    root, size = _inverse_root(correlation)
+
+    whitening = np.zeros(covariance.shape)
+    whitening[places] = root / deviations
+    difference = whitening @ (run.parameters - mean)
+    dof = float(np.median([run.dof, *(other.dof for other in others)]))
+    return Departure(difference, whitening, size, dof)
+
+
+def _inverse_root(correlation: Matrix) -> tuple[Matrix, int]:
+    """Return the symmetric inverse root of a correlation, and its rank.
+
+    A symmetric root turns nothing: directions of different runs are alike.
+    """
     variances, axes = np.linalg.eigh(0.5 * (correlation + correlation.T))
     # Smaller eigenvalues are rounding.
     is_sound = variances > 1e-10 * variances[-1]
-    axes = axes[:, is_sound]
-    # The symmetric root turns nothing: directions of different runs are alike.
-    root = (axes / np.sqrt(variances[is_sound])) @ axes.T
-    whitening = np.zeros(covariance.shape)
-    whitening[np.ix_(is_determined, is_determined)] = root / deviations
-    difference = whitening @ (run.parameters - mean)
-    dof = float(np.median([run.dof, *(o.dof for o in others)]))
-    return Departure(difference, whitening, int(is_sound.sum()), dof)
+    sound_axes = axes[:, is_sound]
+    root = (sound_axes / np.sqrt(variances[is_sound])) @ sound_axes.T
+    return root, int(is_sound.sum())
 
 
 def excess(runs: Runs) -> float:
@@ -236,15 +248,19 @@ def _pool_kind(estimates: Matrix, variances: Matrix, correlation: Matrix):
     typical_variances = counts / np.maximum(information.sum(axis=0), 1e-300)
     # What runs deviate beyond their own errors makes their weights more equal.
     _, ratios = _weighted_spread(estimates, information)
-    between = max(0.0, float(np.nanmean(ratios)) - 1.0) if (counts > 1).any() else 0.0
+    between = 0.0
+    if (counts > 1).any():
+        between = max(0.0, float(np.nanmean(ratios)) - 1.0)
     weights = 1.0 / (variances + between * typical_variances)
     means, ratios = _weighted_spread(estimates, weights)
 
     run_dof = np.maximum(counts - 1.0, 0.0)
     shared, shared_dof = _shared_variance(ratios, run_dof, correlation)
     total_dof = run_dof + shared_dof
-    spreads = (run_dof * np.nan_to_num(ratios) + shared_dof * shared) / total_dof
-    deviations = np.sqrt(spreads / np.maximum(weights.sum(axis=0), 1e-300))
+    own_part = run_dof * np.nan_to_num(ratios)
+    spreads = (own_part + shared_dof * shared) / total_dof
+    total_weights = np.maximum(weights.sum(axis=0), 1e-300)
+    deviations = np.sqrt(spreads / total_weights)
     return means, np.where(counts > 0, deviations, np.inf), total_dof, spreads
 
 
@@ -346,10 +362,12 @@ def drifts(factors: KindFactors) -> list[Drift]:
         values = factors.factors[:, k] * weights
         solution = np.linalg.lstsq(columns, values, rcond=None)[0]
         rest = values - columns @ solution
-        scale = float(rest @ rest) / (count - 2)
-        deviation = np.sqrt(scale * np.linalg.inv(columns.T @ columns)[1, 1])
-        chance = 2.0 * scipy.special.stdtr(count - 2, -abs(solution[1]) / deviation)
+        dof = count - 2
+        scale = float(rest @ rest) / dof
+        covariance = scale * np.linalg.inv(columns.T @ columns)
+        deviation = np.sqrt(covariance[1, 1])
+        chance = 2.0 * scipy.special.stdtr(dof, -abs(solution[1]) / deviation)
         if chance * len(factors.kinds) <= THRESHOLDS.max_chance:
-            quantile = scipy.special.stdtrit(count - 2, 0.5 + 0.5 * LEVEL)
+            quantile = scipy.special.stdtrit(dof, 0.5 + 0.5 * LEVEL)
             found.append(Drift(kind, float(solution[1]), float(quantile * deviation)))
     return found
