@@ -45,7 +45,8 @@ def _verdict(fit: "GeometryFit", findings: list[Remark]) -> Remark:
     if not fit.can_hold_out:
         sentence = (
             "The geometry was not checked on sessions that it has not seen, for which "
-            "at least three are needed"
+            "at least three are needed: record more, or divide the poses (`parts` in "
+            "the experiment file)"
         )
         return Remark(sentence, worst if worst is Status.BAD else Status.DOUBTFUL)
     before = 1e3 * fit.mean_error(fit.held_out.nominal)

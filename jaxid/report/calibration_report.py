@@ -15,11 +15,11 @@ from jaxid.robot.description_files import is_mjcf
 from jaxid.robot.forward_kinematics import tip_jacobian
 
 from .figure import Figure
-from .figure_elements import BLUE, GREY, ORANGE, VERMILION, Curve, Panel
+from .figure_elements import BLUE, GREY, VERMILION, Curve, Panel
 from .result_records import Record, estimate_rows
 from .several_runs_report import Answer, RunsReport
 
-CLASSES = {"below the median": BLUE, "above it": ORANGE, "largest tenth": VERMILION}
+CLASSES = {"below the median": GREY, "above it": BLUE, "largest tenth": VERMILION}
 """Classes of errors in the workspace, and their colours."""
 QUANTILES = (0.5, 0.9)
 """Shares of the poses below the ends of the classes."""
