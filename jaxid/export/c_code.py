@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import Texts
+from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, atomic_folder, fill_template
 from jaxid.program import Program, evaluate, trace
@@ -67,8 +68,14 @@ def export_c(
         Path of the C file; the header is beside it.
 
     Raises:
-        InputError: If `name` is not an identifier of C.
+        InputError: If `name` is not an identifier of C, or the base floats.
     """
+    robot = fit.base.model.robot
+    if robot.floating:
+        raise InputError(
+            f"C code needs a base that is fixed, but that of `{robot.name}` floats: "
+            "export `mjcf` or `urdf`."
+        )
     CWriter(double).declaration(name, (), ())
     functions = c_functions(fit)
     writer = CWriter(double, name, [x.program for x in functions])

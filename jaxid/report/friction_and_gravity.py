@@ -49,7 +49,9 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
     measured_speeds = np.concatenate([np.asarray(log.speeds) for log in logs])
     errors = np.concatenate([log.errors for log in logs])
     panels = []
-    for j in np.flatnonzero(max_speeds).tolist():
+    for j in robot.driven:
+        if max_speeds[j] == 0.0:
+            continue
         model = Curve(speeds[:, j], friction[:, j], "model", BLUE, width=1.4)
         curves = [model, _measured_friction(model, measured_speeds[:, j], errors[:, j])]
         if np.isfinite(half_widths[:, j]).all():

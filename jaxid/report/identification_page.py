@@ -61,7 +61,7 @@ def identification_page(report: Report, figures: Figures) -> str:
     return render_page(
         f"{robot.name}: identified model",
         sections,
-        f"{base.size} base parameters of {robot.joints} joints, from {logs} "
+        f"{base.size} base parameters of {len(robot.driven)} joints, from {logs} "
         f"log{ending}.",
         "All numbers are in result.json and parameters.csv beside this page. Curves "
         "of long logs are thinned out, but keep every peak.",
@@ -155,6 +155,9 @@ def _physics(report: Report, figures: Figures) -> Sections:
         "choose` tries further laws."
     )
     yield "Friction", [text, figures["friction"]]
+    if report.fit.base.model.robot.floating:
+        # An accelerometer measures gravity, which the model then does not know.
+        return
     log = report.verification[0] if report.verification else report.identification[0]
     yield "Gravity", [gravity_table(report.fit, log)]
 

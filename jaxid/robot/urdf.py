@@ -119,6 +119,11 @@ def load_urdf(
     tip_body, tip_rotation, tip_offset = tree.carriers[tree.tip]
     if contacts is None:
         contacts = tree.contact_shapes if floating else {}
+    if contacts and not floating:
+        raise InputError(
+            "`contacts` are those of a robot on legs: add `floating = true`, or leave "
+            "them out."
+        )
     try:
         robot = Robot(
             tree.name,

@@ -28,7 +28,7 @@ from jaxid.robot.contacts import legs_of
 from jaxid.robot.robot import Robot
 
 STEP = 10
-"""Samples for each row of the first fit."""
+"""Samples for each row of the first fit, at most."""
 
 
 class ContactLimits(NamedTuple):
@@ -70,7 +70,7 @@ def check_contacts(
         InputError: If the recording lacks signals of the base.
     """
     robot = base.model.robot
-    findings = [*_frame_findings(robot, recording), *_constant_flags(robot, recording)]
+    findings = [*imu_findings(robot, recording), *_constant_flags(robot, recording)]
     missing = _missing_torques(base, recording, filter)
     signals = base_of(recording, robot)
     stands = signals.stands.copy()
@@ -78,8 +78,9 @@ def check_contacts(
         np.sqrt(np.mean(torque[is_standing] ** 2)) if is_standing.any() else 0.0
         for torque, is_standing in zip(missing.T, stands.T, strict=True)
     ]
-    # A leg that never stands is compared with the others.
-    usual_sizes = np.where(np.array(sizes) > 0.0, sizes, max(sizes, default=0.0))
+    # A leg that never stands is compared with the others; if none does, with all.
+    largest_size = max(sizes) or np.sqrt(np.mean(missing**2))
+    usual_sizes = np.where(np.array(sizes) > 0.0, sizes, largest_size)
     min_samples = LIMITS.duration / recording.sample_time
     for a, b in contact_grid(recording, robot).segments:
         if b - a < min_samples:
@@ -93,7 +94,7 @@ def check_contacts(
                 f"`{robot.contacts[foot].name}` is called in the air from "
                 f"{recording.time[start]:.1f} s to {recording.time[stop - 1]:.1f} s, "
                 f"but its leg carries {100 * loads[foot] / usual_sizes[foot]:.0f} % of "
-                "the load of its other stances: it counts as standing; check "
+                "the load of a leg that stands: it counts as standing; check "
                 "`recording.contact`."
             )
     signals = dataclasses.replace(signals, contacts=stands.astype(float))
@@ -116,21 +117,29 @@ def _missing_torques(
     """Return the torque that each leg lacks if its foot is in the air [N m]."""
     robot = base.model.robot
     log = all_standing(recording, robot)
-    rows = RegressionProblem(base, [observe(log, robot, filter, Subsample(STEP))])
+    step = _row_step(filter, recording.sample_time)
+    rows = RegressionProblem(base, [observe(log, robot, filter, Subsample(step))])
     parameters = WeightedLeastSquares(ResidualVariances())(rows).parameters
     observations = rows.recordings[0]
-    motion = observations.motion[::STEP]
+    motion = observations.motion[::step]
     # Legs feel what moves them, whatever stands.
     predicted = base.forces_in_numpy(parameters, motion)
-    differences = predicted - np.asarray(observations.forces)[::STEP]
+    differences = predicted - np.asarray(observations.forces)[::step]
     torques = []
     for joints in legs_of(robot).own_joints:
         torques.append(np.linalg.norm(differences[:, list(joints)], axis=1))
-    times = observations.time[::STEP]
+    times = observations.time[::step]
     return np.stack(
         [np.interp(np.asarray(recording.time), times, torque) for torque in torques],
         axis=1,
     )
+
+
+def _row_step(filter: AbstractFilter, sample_time: float) -> int:
+    """Return the samples for each row that keep what the filter lets through."""
+    cutoff = filter.low_pass(sample_time).cutoff
+    samples_of_half_period = 0.5 / (cutoff * sample_time)
+    return max(1, min(STEP, int(np.ceil(samples_of_half_period)) - 1))
 
 
 def _constant_flags(robot: Robot, recording: Recording) -> list[str]:
@@ -152,17 +161,29 @@ def _constant_flags(robot: Robot, recording: Recording) -> list[str]:
     return []
 
 
-def _frame_findings(robot: Robot, recording: Recording) -> list[str]:
+def _is_gravity(acceleration: float) -> bool:
+    """Return whether a mean acceleration [m/s²] is that of gravity."""
+    return abs(acceleration / STANDARD_GRAVITY - 1.0) <= LIMITS.gravity
+
+
+def imu_findings(robot: Robot, recording: Recording) -> list[str]:
     """Return findings on the IMU: its unit, and its frame by gravity."""
     signals = base_of(recording, robot)
     up, gravity = measured_vertical(recording, robot)
-    findings = []
-    if abs(gravity / STANDARD_GRAVITY - 1.0) > LIMITS.gravity:
-        findings.append(
-            f"the accelerometer measures {gravity:.3g} m/s² on average, but gravity is "
+    size = float(np.mean(np.linalg.norm(np.asarray(signals.accelerations), axis=1)))
+    if not _is_gravity(gravity):
+        # The vertical is unknown then.
+        if _is_gravity(size):
+            return [
+                "the direction of gravity does not turn as the gyroscope says: check "
+                "`gyro_unit`, and the signs and the order of the columns `gyro`."
+            ]
+        return [
+            f"the accelerometer measures {size:.3g} m/s² on average, but gravity is "
             f"{STANDARD_GRAVITY} m/s²: check `accelerometer_unit`, and that gravity is "
             "not subtracted."
-        )
+        ]
+    findings = []
     normal = feet_normal(recording, robot)
     if normal is not None:
         cosine = np.median(np.sum(normal * up[signals.stands.all(axis=1)], axis=1))

@@ -252,7 +252,10 @@ def error_table(
     """Return relative errors: a row for each joint, a column for each group of logs."""
     columns = []
     for name, logs in groups.items():
-        errors = [*relative_joint_errors(logs), relative_error(logs)]
+        errors_of_joints = relative_joint_errors(logs)
+        has_rows = np.any([np.any(log.counted, axis=0) for log in logs], axis=0)
+        shown_errors = np.where(has_rows, errors_of_joints, np.nan)
+        errors = [*shown_errors, relative_error(logs)]
         columns.append(Column(name, errors, "%", percent))
     return Table(
         "torque errors (RMS) over torques (RMS)",

@@ -85,7 +85,7 @@ class IdentificationReport(Summarised, Report):
                 "other logs": self.verification,
             }
         joint_errors = {name: logs for name, logs in groups.items() if logs}
-        title = f"{robot.name}: {robot.joints} joints, {base.size} base parameters"
+        title = f"{robot.name}: {len(robot.driven)} joints, {base.size} base parameters"
         return [
             Table(title, remarks=self.judgement.overview()),
             error_table(joint_errors, robot.joint_names),

@@ -48,8 +48,9 @@ class Inspection(Summarised):
         """Whether the logs can be identified with, in one sentence."""
         base = self.setup.base
         if not self.logs:
+            robot = base.model.robot
             return Remark(
-                f"{base.model.robot.name} has {base.model.robot.joints} joints, and "
+                f"{robot.name} has {len(robot.driven)} joints, and "
                 f"{base.size} base parameters of {base.model.size} standard parameters"
             )
         count = sum(len(log.doubts) for log in self.logs)
