@@ -184,7 +184,7 @@ def held_forces(robot: Robot, recording: Recording) -> list[str]:
     Steps of a coarse sensor last differently long; those of a slow one equally long.
     """
     statistics = clock_statistics(recording)
-    if statistics is None or statistics.is_held:
+    if statistics is None or statistics.is_held or recording.forces is None:
         return []
     findings = []
     for name, channel in zip(robot.joint_names, recording.forces.T, strict=True):

@@ -182,6 +182,8 @@ def _shortened(segments: Sequence[_GridSegment]) -> list[_GridSegment]:
 
 def _grid_segments(robot: Robot, recording: Recording) -> list[_GridSegment]:
     """Return the segments of a recording that are long enough for both filters."""
+    if recording.forces is None:
+        return []
     dt = recording.sample_time
     angles, _, forces = joint_side(
         robot, recording, recording.angles, None, recording.forces
