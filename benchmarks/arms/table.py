@@ -17,6 +17,8 @@ def number(value, digits=2):
     """Return a number with so many significant digits; a dash for none."""
     if value is None or not np.isfinite(value):
         return "–" if value is None or np.isnan(value) else "diverges"  # noqa: RUF001
+    if value >= 100:
+        return f"{value:.0f}"
     return f"{value:#.{digits}g}".rstrip(".")
 
 
