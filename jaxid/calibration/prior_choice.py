@@ -99,9 +99,10 @@ def _mean_size(
     pose_weights: Vector,
 ) -> float:
     """Return the mean size of a session's errors after a step of the others."""
-    own = equations[session]
+    session_equations = equations[session]
     columns = problem.session_columns[session]
-    frame_step = own.frame_slopes @ step + own.frame_step
+    frame_step = session_equations.frame_slopes @ step
+    frame_step = frame_step + session_equations.frame_step
     jacobian = linearisation.jacobian
     changes = (
         jacobian[:, problem.common_columns] @ step + jacobian[:, columns] @ frame_step

@@ -355,8 +355,11 @@ def drifts(factors: KindFactors) -> list[Drift]:
         return []
     # From -0.5 at the first run to 0.5 at the last: the slope is the whole change.
     order = np.linspace(-0.5, 0.5, count)
-    found = []
+    steady_changes = []
     for k, kind in enumerate(factors.kinds):
+        # Runs may not determine the factor of a kind, such as that of values of zero.
+        if not np.all(factors.deviations[:, k] > 0):
+            continue
         weights = 1.0 / factors.deviations[:, k]
         columns = np.stack([np.ones(count), order], axis=1) * weights[:, None]
         values = factors.factors[:, k] * weights
@@ -369,5 +372,6 @@ def drifts(factors: KindFactors) -> list[Drift]:
         chance = 2.0 * scipy.special.stdtr(dof, -abs(solution[1]) / deviation)
         if chance * len(factors.kinds) <= THRESHOLDS.max_chance:
             quantile = scipy.special.stdtrit(dof, 0.5 + 0.5 * LEVEL)
-            found.append(Drift(kind, float(solution[1]), float(quantile * deviation)))
-    return found
+            half_width = float(quantile * deviation)
+            steady_changes.append(Drift(kind, float(solution[1]), half_width))
+    return steady_changes

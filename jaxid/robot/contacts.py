@@ -122,13 +122,13 @@ def legs_of(robot: Any) -> Legs:
     shared_joints = sorted({i for i in carried_feet if carried_feet.count(i) > 1})
     own_joints = []
     for contact, chain in zip(robot.contacts, chains, strict=True):
-        own = tuple(i for i in chain if i not in shared_joints)
-        if not own:
+        leg_joints = tuple(i for i in chain if i not in shared_joints)
+        if not leg_joints:
             raise InputError(
                 f"contact `{contact.name}` must be on a leg of its own: give the feet "
                 "of one leg as one `Sole()`."
             )
-        own_joints.append(own)
+        own_joints.append(leg_joints)
     rows = (*robot.virtual[:GROUP], *shared_joints)
     return Legs(rows, tuple(own_joints))
 
