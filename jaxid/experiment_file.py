@@ -264,17 +264,6 @@ KEYS: dict[str, TomlTable] = {
     },
 }
 """Keys of each table, and what their values may be, as `decode_value` takes it."""
-FORMER_KEYS = {
-    ("model", "coulomb", "dead_zone"): 0.0,
-    ("rollout", "friction"): True,
-    ("rollout", "saturation"): True,
-    ("rollout", "integral"): False,
-    ("rollout", "torque_rows"): False,
-    ("rollout", "gains"): False,
-    ("rollout", "load_friction"): False,
-    ("excitation", "polish"): 4,
-}
-"""Keys that earlier templates wrote, with the values that change nothing."""
 
 
 def read_experiment_text(path: Path) -> str:
@@ -303,7 +292,6 @@ def parse_tables(text: str, path: Path) -> TomlTable:
         raise InputError(
             f"{path.name}: the file is not TOML in UTF-8: {fault}."
         ) from error
-    _drop_former_keys(tables)
     try:
         _require_tables(tables)
         tables = {
@@ -315,22 +303,6 @@ def parse_tables(text: str, path: Path) -> TomlTable:
     except InputError as error:
         raise InputError(f"{path.name}: {error}") from error
     return tables
-
-
-def _drop_former_keys(tables: TomlTable) -> None:
-    """Remove keys that earlier templates wrote, at the values that change nothing."""
-    for (*places, key), value in FORMER_KEYS.items():
-        table = _table_at(tables, places)
-        if isinstance(table, dict) and table.get(key) == value:
-            del table[key]
-
-
-def _table_at(tables: TomlTable, places: Iterable[str]) -> Any:
-    """Return a table within tables; None if it is missing."""
-    table: Any = tables
-    for place in places:
-        table = table.get(place) if isinstance(table, dict) else None
-    return table
 
 
 def _require_tables(tables: TomlTable) -> None:

@@ -1,10 +1,9 @@
 """Decoding of TOML tables: a table calls a function with its keys as arguments.
 
 `experiment_file.py` declares the values of the keys and has checked them. Names and
-defaults of the keys are those of the arguments, and the function's docstring describes
-them: `keys_of` gives all of it, also for the template that `jaxid init` prints. The
-function may be a class of the package. Of other functions, arguments before the `*`
-come from elsewhere and are no keys.
+defaults of the keys are those of the arguments. The function may be a class of the
+package. Of other functions, arguments before the `*` come from elsewhere and are no
+keys.
 """
 
 import dataclasses
@@ -12,7 +11,7 @@ import inspect
 import re
 import typing
 from collections.abc import Callable, Iterable, Sequence
-from typing import Annotated, Any, NamedTuple
+from typing import Annotated, Any
 
 from jaxid.errors import InputError
 from jaxid.experiment_file import within
@@ -20,19 +19,12 @@ from jaxid.experiment_values import TomlTable, check_names
 from jaxid.io import union_members
 from jaxid.units import Unit
 
-
-class Key(NamedTuple):
-    """A key of a table."""
-
-    name: str  # name in the file
-    hint: Any  # annotation of the argument
-    default: Any  # default value; `inspect.Parameter.empty` if the key is needed
-    text: str  # description, from the docstring
+Keys = dict[str, inspect.Parameter]
+"""Keys of a table by their names, with their annotations and defaults."""
 
 
-def keys_of(function: Callable) -> dict[str, Key]:
+def keys_of(function: Callable) -> Keys:
     """Return the keys of a table that calls a function or class."""
-    texts = descriptions(function)
     # Converters widen the annotations of arguments; those of the fields say what is
     # meant.
     hints = typing.get_type_hints(function, include_extras=True)
@@ -41,20 +33,8 @@ def keys_of(function: Callable) -> dict[str, Key]:
         name = argument.name
         if isinstance(function, type) or argument.kind is argument.KEYWORD_ONLY:
             hint = hints.get(name, argument.annotation)
-            keys[name] = Key(name, hint, argument.default, texts.get(name, ""))
+            keys[name] = argument.replace(annotation=hint)
     return keys
-
-
-def descriptions(function: Callable) -> dict[str, str]:
-    """Return the descriptions of arguments or attributes in a docstring, by name."""
-    text = inspect.getdoc(function) or ""
-    sections = re.findall(
-        r"^(?:Args|Attributes):\n((?:    .*\n?|\n)+)", text, flags=re.M
-    )
-    entries = re.findall(
-        r"^    (\w+): ((?:.*\n?)(?:        .*\n?)*)", "\n".join(sections), re.M
-    )
-    return {name: " ".join(words.split()) for name, words in entries}
 
 
 def call(function: Callable, table: Any, place: str, *context: Any) -> Any:
@@ -77,7 +57,7 @@ def decode(
     Arguments in `skip` are no keys; keys without default are needed where the table is
     `complete`.
     """
-    keys: dict[str, Key] = {}
+    keys: Keys = {}
     for function in functions:
         keys |= keys_of(function)
     for name in skip:
@@ -86,7 +66,7 @@ def decode(
     if complete:
         _require_keys(keys, table, place)
     values = {
-        name: _build_inner(value, keys[name].hint, f"{place}.{name}")
+        name: _build_inner(value, keys[name].annotation, f"{place}.{name}")
         for name, value in table.items()
     }
     groups = []
@@ -96,10 +76,10 @@ def decode(
     return groups
 
 
-def _require_keys(keys: dict[str, Key], table: TomlTable, place: str) -> None:
+def _require_keys(keys: Keys, table: TomlTable, place: str) -> None:
     """Reject a table that lacks a key without default."""
     for name, key in keys.items():
-        if key.default is inspect.Parameter.empty and name not in table:
+        if key.default is key.empty and name not in table:
             table_name = re.sub(r"\[\d+\]", "", place)
             raise InputError(f"`{place}.{name}` is missing: `[{table_name}]` needs it.")
 

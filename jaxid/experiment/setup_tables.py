@@ -115,11 +115,11 @@ def _speed(
 
 
 SWITCHES = {name: term for name, term in terms.TERMS.items() if term.is_switch}
-"""Terms that a key of `[model]` with their name adds, like `springs = true`."""
+"""Terms that a field of `Effects` with their name adds, like `springs`."""
 
 
 @dataclasses.dataclass(frozen=True)
-class AbstractEffects:
+class Effects:
     """Effects in the model in addition to rigid bodies.
 
     Attributes:
@@ -136,6 +136,8 @@ class AbstractEffects:
         offset: Whether there is a constant force at each joint (sensor offsets); by
             default unless dry friction is asymmetric.
         coulomb: Dry friction, as a table; or none, like `false`.
+        square_root: Friction that grows more slowly than speed.
+        springs: A spring at each joint that pulls it to a position of rest.
     """
 
     principal_axes: bool = False
@@ -146,6 +148,8 @@ class AbstractEffects:
     rotor_inertia: bool = True
     offset: bool | None = None
     coulomb: bool | DryFriction | None = None
+    square_root: bool = False
+    springs: bool = False
 
     def __post_init__(self) -> None:
         if self.load and self.principal_axes:
@@ -183,18 +187,6 @@ class AbstractEffects:
             if getattr(self, name):
                 effects[name] = switch.with_transition(transition)
         return tuple(effects[name] for name in terms.TERMS if name in effects)
-
-
-Effects = dataclasses.make_dataclass(
-    "Effects",
-    [(name, bool, False) for name in SWITCHES],
-    bases=(AbstractEffects,),
-    frozen=True,
-)
-Effects.__doc__ = f"{inspect.getdoc(AbstractEffects)}\n" + "\n".join(
-    f"    {name}: {(inspect.getdoc(term) or '').splitlines()[0]}"
-    for name, term in SWITCHES.items()
-)
 
 
 @dataclasses.dataclass(frozen=True)
