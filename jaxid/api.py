@@ -59,7 +59,6 @@ from .identification.force_sensor import (
     identify_sensor_rotation as identify_sensor_rotation,
 )
 from .identification.friction_laws import (
-    identify_nonlinear_friction as identify_nonlinear_friction,
     identify_presliding as identify_presliding,
     identify_transition_speeds as identify_transition_speeds,
 )

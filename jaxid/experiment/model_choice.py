@@ -11,18 +11,17 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import equinox as eqx
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import AbstractTerm, LoadFriction, Tanh
+from jaxid.dynamics.terms import AbstractTerm, LoadFriction, StribeckFriction, Tanh
 from jaxid.errors import InputError
 from jaxid.identification.consistency import PhysicallyConsistent
 from jaxid.identification.friction_laws import (
     identify_presliding,
+    identify_stribeck_speeds,
     identify_transition_speeds,
-    minimum_place,
 )
 from jaxid.identification.model_selection import (
     BODY_RIDGE,
@@ -58,8 +57,6 @@ from .experiment import Experiment, parse_experiment
 
 MIN_SPEED_SHARE = 0.05
 """Speed below which rows may be left out, relative to a joint's largest speed."""
-STRIBECK_SHARES = np.geomspace(0.01, 0.3, 6)
-"""Stribeck speeds that are tried, relative to a joint's largest speed."""
 
 
 def choose_model(
@@ -242,8 +239,10 @@ class ModelSearch:
         self._estimates = estimate_without_parts(problem, self.parts, estimator)
         if "Stribeck" in self._effects and "Stribeck" not in self._changes:
             base = base_parameters(self._model(self._effects["Stribeck"]))
-            speeds = stribeck_speeds(base, logs, self._max_speeds)
-            self._effects["Stribeck"] = {"model": {"coulomb": {"stribeck": speeds}}}
+            base = identify_stribeck_speeds(base, logs)
+            self._effects["Stribeck"] = {
+                "model": {"coulomb": {"stribeck": _stribeck_speeds(base)}}
+            }
         self._sources: dict[str | None, ColumnSource] = {}
 
     def _fit(
@@ -423,28 +422,7 @@ def join_terms(models: Sequence[Model]) -> tuple[AbstractTerm, ...]:
     return tuple(terms.values())
 
 
-def stribeck_speeds(
-    base: BaseParameters, logs: Sequence[Observations], max_speeds
-) -> list[float]:
-    """Return the Stribeck speed of each joint that explains its own rows best.
-
-    For each trial the speeds of the transitions are found anew.
-    """
-    squares = []
-    for share in STRIBECK_SHARES:
-        terms = []
-        for term in base.model.terms:
-            if hasattr(term, "speed"):
-                term = dataclasses.replace(term, speed=share * max_speeds)
-            terms.append(term)
-        model = dataclasses.replace(base.model, terms=tuple(terms))
-        trial_base = eqx.tree_at(lambda x: x.model, base, model)
-        trial_base = identify_transition_speeds(trial_base, logs)
-        factors = RegressionProblem(trial_base, logs).factors
-        # The last entry of a triangle is what the columns leave of the forces.
-        squares.append([joint.R[-1, -1] ** 2 for joint in factors.joints])
-    numbers = [minimum_place(values) for values in np.transpose(squares)]
-    # Between two trials the logarithm of the speed is interpolated.
-    trial_numbers = np.arange(len(STRIBECK_SHARES))
-    shares = np.exp(np.interp(numbers, trial_numbers, np.log(STRIBECK_SHARES)))
-    return [float(f"{x:.2g}") for x in shares * max_speeds]
+def _stribeck_speeds(base: BaseParameters) -> list[float]:
+    """Return the Stribeck speeds of a model as an experiment file holds them."""
+    term = next(x for x in base.model.terms if isinstance(x, StribeckFriction))
+    return [float(f"{speed:.2g}") for speed in np.asarray(term.speed)]

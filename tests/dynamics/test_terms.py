@@ -3,7 +3,6 @@
 import inspect
 from pathlib import Path
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -340,25 +339,6 @@ def test_warm_friction_is_smaller(robot):
     np.testing.assert_allclose(
         _columns(warm, robot), np.diag(np.exp(-20 * rates) * QD), rtol=1e-12
     )
-
-
-def test_every_nonlinear_parameter_is_found_in_its_term():
-    """Names are unique, and changing the value changes the columns."""
-    stribeck = StribeckFriction(transition=Tanh(0.01))
-    wrapped = TemperatureScaled(stribeck, temperature=40.0)
-    assert [s.name for s in wrapped.nonlinear_parameters] == [
-        "eps",
-        "vs",
-        "delta",
-        "rate",
-    ]
-    before = np.asarray(wrapped.columns(TREE.robot(), Q, 0.1 * QD, QDD))
-    for shape in wrapped.nonlinear_parameters:
-        other = eqx.tree_at(shape.value, wrapped, 1.5 * shape.value(wrapped))
-        assert np.any(
-            np.asarray(other.columns(TREE.robot(), Q, 0.1 * QD, QDD)) != before
-        )
-    assert CoulombFriction(HardSign()).nonlinear_parameters == ()
 
 
 def test_base_parameters_see_friction_near_standstill():

@@ -223,8 +223,6 @@ def test_presliding_of_another_law_is_found_with_coarse_encoders():
 
 def test_what_cannot_have_memory_says_so():
     base, (log, _) = jid.base_parameters(model_of(Presliding())), log_of(400)
-    with pytest.raises(InputError, match="Presliding"):
-        jid.identify_nonlinear_friction(base, log)
     m = log.motion
     with pytest.raises(InputError, match="memory"):
         jid.identify_batch(

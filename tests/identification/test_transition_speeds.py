@@ -84,9 +84,16 @@ def test_a_setup_finds_them_says_so_and_saves_them(tmp_path):
     np.testing.assert_array_equal(found_speeds(other.base), found_speeds(fit.base))
 
 
-def test_shapes_begin_at_a_number_where_none_is_given():
-    shapes = jid.friction_laws.select_shapes(base_of(StribeckFriction(0.1)))
-    assert np.isfinite(shapes.values).all()
+def test_stribeck_speeds_are_found_again():
+    """Without noise they are found to a fraction of the ratio between two trials."""
+    true_speeds = np.array([0.2, 0.3])
+    model = jid.Model(ROBOT, (*BODIES, StribeckFriction(true_speeds, 2.0, Tanh(0.02))))
+    p = virtual.standard_parameters(model, seed=3)
+    log = virtual.observations(model, p, samples=1500)
+    base = jid.friction_laws.identify_stribeck_speeds(base_of(StribeckFriction()), log)
+    np.testing.assert_allclose(base.model.terms[-1].speed, true_speeds, rtol=0.2)
+    with pytest.raises(jid.InputError, match="StribeckFriction"):
+        jid.friction_laws.identify_stribeck_speeds(base_of(CoulombFriction()), log)
 
 
 RAIL = """<mujoco><option timestep="0.0005"/><worldbody><body>

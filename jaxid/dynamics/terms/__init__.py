@@ -32,7 +32,6 @@ from .rigid_bodies import RigidBodies as RigidBodies, SensorLoad as SensorLoad
 from .term import (
     AbstractTerm as AbstractTerm,
     JointParameter as JointParameter,
-    NonlinearParameter as NonlinearParameter,
 )
 
 TERMS: dict[str, type[AbstractTerm]] = {

@@ -21,8 +21,6 @@ from jaxid.arrays import (
 )
 from jaxid.errors import InputError
 
-from .term import NonlinearParameter
-
 EachJoint = float | Float[AnyArray, "..."]
 """One number for all joints, or one for each."""
 States = Float[AnyArray, " states"]
@@ -41,11 +39,6 @@ class AbstractTransition(Hashable):
     def of_motors(self, speeds: Joints) -> Joints:
         """Return the same for the motors' speeds, on the side of their joints."""
         return self(speeds)
-
-    @property
-    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """Parameters that `identify_nonlinear_friction` can identify."""
-        return ()
 
 
 class Tanh(AbstractTransition):
@@ -78,11 +71,6 @@ class Tanh(AbstractTransition):
         """Return the smooth sign of the speed."""
         sign = jnp.tanh(qd / matching("epsilon", self.speed, qd))
         return _outside_dead_zone(self.dead_zone, qd, sign)
-
-    @property
-    def nonlinear_parameters(self):
-        """`eps1`, … [rad/s or m/s]."""
-        return (NonlinearParameter("eps", ("rad/s", "m/s"), ("epsilon",)),)
 
 
 def is_open(part: Any) -> bool:

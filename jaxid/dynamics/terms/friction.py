@@ -1,6 +1,6 @@
 """Friction of joints: terms that depend on speed, load and temperature."""
 
-from typing import Any, ClassVar
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -14,30 +14,18 @@ from jaxid.robot.inertia import INERTIAL_NAMES
 from jaxid.robot.robot import Robot
 
 from .dry_friction_transitions import AbstractTransition, EachJoint, Tanh
-from .term import AbstractTerm, JointParameter, NonlinearParameter, on_drives
+from .term import AbstractTerm, JointParameter, on_drives
 
 
 class AbstractDryFriction(AbstractTerm):
     """Friction with a `transition` from one direction of motion to the other."""
 
     transition: eqx.AbstractVar[AbstractTransition]
-    # Where not, it is identified only if chosen: `CoulombFriction` determines it
-    # better.
-    determines_transition: ClassVar[bool] = True
 
     @classmethod
     def with_transition(cls, transition):
         """Return the term with a transition, and defaults of all else."""
         return cls(transition=transition)
-
-    @property
-    def nonlinear_parameters(self):
-        """Those of the transition."""
-        parameters = []
-        for x in self.transition.nonlinear_parameters:
-            is_default = x.default and self.determines_transition
-            parameters.append(x.inside("transition")._replace(default=is_default))
-        return tuple(parameters)
 
 
 class ViscousFriction(AbstractTerm):
@@ -132,7 +120,6 @@ class SquareRootFriction(AbstractDryFriction):
     """
 
     transition: AbstractTransition = Tanh()
-    determines_transition = False
     is_switch = True
     choice = "root of speed"
     shares_friction = True
@@ -188,15 +175,6 @@ class StribeckFriction(AbstractDryFriction):
             [on_drives(robot, sign), on_drives(robot, static_friction)], axis=1
         )
 
-    @property
-    def nonlinear_parameters(self):
-        """Those of the transition, speeds `vs1`, …, and `delta1`, … if chosen."""
-        return (
-            *super().nonlinear_parameters,
-            NonlinearParameter("vs", ("rad/s", "m/s"), ("speed",)),
-            NonlinearParameter("delta", ("1", "1"), ("exponent",), default=False),
-        )
-
 
 class LoadFriction(AbstractDryFriction):
     r"""Dry friction by load, $|g_i(q)| \tanh(\dot q_i / \epsilon)$.
@@ -214,7 +192,6 @@ class LoadFriction(AbstractDryFriction):
 
     bodies: Float[AnyArray, "..."]
     transition: AbstractTransition = Tanh()
-    determines_transition = False
     joint_parameters = (
         JointParameter("fl", "friction in proportion to the load", ("1", "1"), "load"),
     )
@@ -288,9 +265,3 @@ class TemperatureScaled(AbstractTerm):
     def drive_matrices(self, robot):
         """Return those of the term: temperature scales them by a positive number."""
         return self.term.drive_matrices(robot)
-
-    @property
-    def nonlinear_parameters(self):
-        """Those of the term, and `rate1`, … [1/K] if chosen."""
-        rate = NonlinearParameter("rate", ("1/K", "1/K"), ("rate",), default=False)
-        return (*(x.inside("term") for x in self.term.nonlinear_parameters), rate)

@@ -1,6 +1,5 @@
-"""Abstract term of a model, and the nonlinear parameters that a term may have."""
+"""Abstract term of a model, and the parameters of which it has one for each joint."""
 
-import functools
 from abc import abstractmethod
 from typing import Any, ClassVar, Literal, NamedTuple
 
@@ -16,32 +15,6 @@ TermParameters = Float[AnyArray, " columns"]
 """One number for each parameter of a term."""
 NamesAndUnits = tuple[tuple[str, str], ...]
 """Name and unit of each parameter."""
-
-
-class NonlinearParameter(NamedTuple):
-    """Positive number of a friction law in which forces are not linear.
-
-    Attributes:
-        name: Name without the joint's number.
-        units: Units for a revolute and a prismatic joint.
-        path: Attributes that lead to it, from the term (or transition) that declares
-            it.
-        default: Whether `identify_nonlinear_friction` identifies it unless other names
-            are given.
-    """
-
-    name: str
-    units: tuple[str, str]
-    path: tuple[str, ...]
-    default: bool = True
-
-    def value(self, owner: Any) -> Any:
-        """Return the value in its term: a scalar, or one for each joint."""
-        return functools.reduce(getattr, self.path, owner)
-
-    def inside(self, attribute: str) -> "NonlinearParameter":
-        """Return the parameter as seen from a term that holds its owner."""
-        return self._replace(path=(attribute, *self.path))
 
 
 class JointParameter(NamedTuple):
@@ -145,11 +118,6 @@ class AbstractTerm(eqx.Module):
     def potential_columns(self, robot: Robot, q: Joints) -> TermParameters:
         """Return the potential energy [J] of unit parameters."""
         return jnp.zeros(len(self.parameters(robot)), q.dtype)
-
-    @property
-    def nonlinear_parameters(self) -> tuple[NonlinearParameter, ...]:
-        """Parameters that `identify_nonlinear_friction` can identify."""
-        return ()
 
     @property
     def body_parameters(self) -> int:

@@ -54,25 +54,43 @@ def identify_transition_speeds(
     # Friction with memory follows the path: its speed matters at the first sample only.
     if model.memory is not None or not has_open_transition(model.terms):
         return base
-    is_one_log = isinstance(observations, Observations)
-    logs = (observations,) if is_one_log else tuple(observations)
-    top_speeds = _top_speeds(logs)
-    speeds = np.outer(SPEED_SHARES, top_speeds)
-    speeds[:, top_speeds == 0] = USUAL_SPEED
+    logs = as_logs(observations)
+    max_speeds = top_speeds(logs)
+    trial_speeds = np.outer(SPEED_SHARES, max_speeds)
+    trial_speeds[:, max_speeds == 0] = USUAL_SPEED
 
-    trials = SpeedTrials.of(base, speeds)
+    trials = SpeedTrials.of(base, trial_speeds)
     factors = RegressionProblem(trials.base, logs).factors
-    numbers = [minimum_place(trials.squares(joint)) for joint in factors.joints]
+    squares = [trials.squares(joint) for joint in factors.joints]
+    speeds = best_speeds(squares, SPEED_SHARES, max_speeds)
+    speeds = np.where(max_speeds > 0, speeds, USUAL_SPEED)
+    return eqx.tree_at(lambda b: b.model, base, model.with_transition_speeds(speeds))
+
+
+def as_logs(observations: ObservedLogs) -> tuple[Observations, ...]:
+    """Return one log or several as a tuple."""
+    is_one_log = isinstance(observations, Observations)
+    return (observations,) if is_one_log else tuple(observations)
+
+
+def best_speeds(
+    squares: Sequence[Vector], shares: Vector, max_speeds: Joints
+) -> Joints:
+    """Return the speed of each joint with the least squared error of its own rows.
+
+    Args:
+        squares: For each joint the squared error of each trial.
+        shares: Speed of each trial, relative to the joint's top speed.
+        max_speeds: Top speeds [rad/s or m/s].
+    """
+    numbers = [minimum_place(values) for values in squares]
     # Between two trials the logarithm of the speed is interpolated.
-    trial_numbers = np.arange(len(SPEED_SHARES))
-    shares = np.exp(np.interp(numbers, trial_numbers, np.log(SPEED_SHARES)))
-    best_speeds = np.where(top_speeds > 0, shares * top_speeds, USUAL_SPEED)
-    return eqx.tree_at(
-        lambda b: b.model, base, model.with_transition_speeds(best_speeds)
-    )
+    trial_numbers = np.arange(len(shares))
+    best_shares = np.exp(np.interp(numbers, trial_numbers, np.log(shares)))
+    return best_shares * max_speeds
 
 
-def _top_speeds(logs: Sequence[Observations]) -> Joints:
+def top_speeds(logs: Sequence[Observations]) -> Joints:
     """Return the top speed of each joint, zero where it rests [rad/s or m/s]."""
     lowest_angles = []
     highest_angles = []
