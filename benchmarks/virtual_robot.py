@@ -43,6 +43,7 @@ import time
 import jax
 import numpy as np
 import timing
+from references.mujoco_robot import MujocoRobot
 from scipy.stats import norm
 
 import jaxid as jid
@@ -104,15 +105,15 @@ def agreement(virtual):
         virtual.robot, omega=0.8, reach=0.5, seed=1
     )
     motion = trajectory.motion(np.linspace(0.0, DURATION, 500))
-    apart = np.abs(
-        smooth.forces(motion) - jid.simulation.MujocoRobot(smooth).forces(motion)
-    ).max(axis=0)
+    apart = np.abs(smooth.forces(motion) - MujocoRobot(smooth).forces(motion)).max(
+        axis=0
+    )
     print(header("ours less MuJoCo's", AXES))
     print(line("inverse dynamics [1e-15 of the largest force]", 1e15 * apart / most))
     for name, robot in (("without dry friction", smooth), ("with it", virtual)):
         ours, theirs = (
             tracked(machine, robot, 1, substeps=4)
-            for machine in (robot, jid.simulation.MujocoRobot(robot))
+            for machine in (robot, MujocoRobot(robot))
         )
         difference = 100 * rms(ours.forces - theirs.forces) / most
         print(line(f"torques in the servo experiment, {name} [%]", difference))
@@ -130,7 +131,7 @@ def identified(virtual, disturbed):
     print()
     print(header("logs of", ["intervals that hold", *(f"axis {k} [%]" for k in AXES)]))
     for name, machine in (
-        ("MuJoCo", jid.simulation.MujocoRobot(virtual)),
+        ("MuJoCo", MujocoRobot(virtual)),
         ("ours, as the model", virtual),
         ("ours, disturbed", disturbed),
     ):
@@ -251,7 +252,7 @@ def speed(disturbed):
     print("| one second of the experiment at 1 kHz | processor time [s] |\n|---|---|")
     for name, machine in (
         ("ours, everything on", disturbed),
-        ("MuJoCo", jid.simulation.MujocoRobot(disturbed)),
+        ("MuJoCo", MujocoRobot(disturbed)),
     ):
         tracked(machine, disturbed, 1)
         start = time.process_time()

@@ -1,4 +1,4 @@
-"""Virtual robots: experiments whose truth is known, on our own physics or on MuJoCo."""
+"""Virtual robots: experiments whose truth is known."""
 
 from .example import virtual_panda as virtual_panda, write_example as write_example
 from .friction_and_ripple import (
@@ -9,7 +9,6 @@ from .friction_and_ripple import (
     TorqueRipple as TorqueRipple,
 )
 from .mechanics import Servo as Servo
-from .mujoco import MujocoRobot as MujocoRobot
 from .tx90l import (
     cad_tx90l_on_rail as cad_tx90l_on_rail,
     virtual_tx90l_on_rail as virtual_tx90l_on_rail,

@@ -7,13 +7,13 @@ import pinocchio as pin
 import pytest
 from export_samples import fit_of, motion, possible
 from follower_arms import follower_arm
+from mujoco_robot import MujocoRobot
 
 import jaxid as jid
 from jaxid.errors import InputError
 from jaxid.program import evaluate
 from jaxid.robot.urdf import urdf_parameters
 from jaxid.simulation.friction_and_ripple import SmoothFriction
-from jaxid.simulation.mujoco import MujocoRobot
 from jaxid.simulation.virtual import Sensors, VirtualRobot
 
 SMALL = "follower of a follower"

@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from mujoco_robot import MujocoRobot
 
 import jaxid as jid
 from jaxid.dynamics.motion import Motion
@@ -15,8 +16,6 @@ from jaxid.simulation.virtual import Sensors, VirtualRobot, random_bodies
 from jaxid.trajectory.fourier import random_fourier_series
 
 pytest.importorskip("mujoco", reason="MuJoCo is not installed (extra `mujoco`)")
-
-from jaxid.simulation.mujoco import MujocoRobot
 
 
 def ur10(tool=False):

@@ -1,4 +1,4 @@
-"""The same experiment on MuJoCo, independent of this package (extra `mujoco`)."""
+"""The experiment of a virtual robot on MuJoCo, independent of the package's physics."""
 
 import contextlib
 import dataclasses
@@ -13,8 +13,7 @@ from jaxid.errors import InputError
 from jaxid.export.feed_forward import body_parameters
 from jaxid.export.mujoco_model import mjcf_text
 from jaxid.robot.mjcf import import_mujoco
-
-from .virtual import PerSample, VirtualRobot
+from jaxid.simulation.virtual import PerSample, VirtualRobot
 
 
 class MujocoRobot(VirtualRobot):
