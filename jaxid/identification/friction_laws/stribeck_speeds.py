@@ -52,7 +52,7 @@ def identify_stribeck_speeds(
         factors = RegressionProblem(trial_base, logs).factors
         # The last entry of a triangle is what the columns leave of the forces.
         squares.append([joint.R[-1, -1] ** 2 for joint in factors.joints])
-    speeds = best_speeds(np.transpose(squares), SPEED_SHARES, max_speeds)
+    speeds = best_speeds(list(np.transpose(squares)), SPEED_SHARES, max_speeds)
     return _with_speeds(base, speeds)
 
 
