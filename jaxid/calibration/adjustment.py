@@ -1,7 +1,7 @@
 """Gauss-Newton search in which each session's own frames are eliminated first.
 
-What remains are normal equations of each session in the unknowns that all share. Sums
-of them with other weights are the searches without a session, and bootstrap draws.
+What remains are equations of each session in the unknowns that all share. Sums of them
+with other weights are the searches without a session, and bootstrap draws.
 """
 
 from typing import NamedTuple
@@ -14,24 +14,26 @@ from .problem import CalibrationProblem, Linearisation
 
 MAX_STEPS = 30
 """Steps after which a search is given up."""
-END_OF_SEARCH = 1e-6
+END_OF_SEARCH = 1e-5
 """Largest step at which a search has ended, relative to the prior's deviations."""
+MIN_EFFECT = 1e-9
+"""Effect of a session's frames, relative to the largest, below which it is rounding."""
 
 
 class SessionEquations(NamedTuple):
-    """Normal equations of one session, without the frames that only it has.
+    """Equations of one session for the unknowns that all sessions share.
 
     Attributes:
-        matrix: Second derivatives of half the sum of squares by the common unknowns.
-        gradient: Its gradient.
-        frame_slopes: Change of the frames by that of the common unknowns.
+        errors: Errors that no motion of the session's own frames explains.
+        jacobian: Their derivatives by the common unknowns.
         frame_step: Step of the frames while the common unknowns stay.
+        frame_slopes: Change of the frames by that of the common unknowns.
     """
 
-    matrix: Matrix
-    gradient: Vector
-    frame_slopes: Matrix
+    errors: Vector
+    jacobian: Matrix
     frame_step: Vector
+    frame_slopes: Matrix
 
 
 class Adjustment(NamedTuple):
@@ -67,80 +69,63 @@ def adjust(
         max_steps: Largest number of steps.
     """
     common = problem.common_columns
-    state = _linearised(problem, start, scales, weights)
-    for _ in range(max_steps):
-        step = common_step(
-            state.equations, state.vector[common], scales[common], weights.sessions
-        )
-        if np.abs(divided(step, scales[common])).max() < END_OF_SEARCH:
-            return state._replace(has_converged=True)
-        vector = moved(problem, state.equations, state.vector, step)
-        state = _linearised(problem, vector, scales, weights)
-    return state
-
-
-def _linearised(
-    problem: CalibrationProblem, vector: Vector, scales: Vector, weights: Weights
-) -> Adjustment:
-    """Return unknowns with the equations there."""
-    linearisation = problem.linearise(vector)
-    equations = session_equations(problem, linearisation, vector, scales, weights.poses)
-    return Adjustment(vector, linearisation, equations, False)
+    vector = start
+    steps_left = max_steps
+    while True:
+        linearisation = problem.linearise(vector)
+        equations = session_equations(problem, linearisation, scales, weights.poses)
+        step = common_step(equations, vector[common], scales[common], weights.sessions)
+        largest_step = np.abs(divided(step, scales[common])).max()
+        has_converged = bool(largest_step < END_OF_SEARCH)
+        if has_converged or steps_left == 0:
+            return Adjustment(vector, linearisation, equations, has_converged)
+        steps_left -= 1
+        vector = vector.copy()
+        vector[common] += step
+        for columns, x in zip(problem.session_columns, equations, strict=True):
+            vector[columns] += x.frame_slopes @ step + x.frame_step
 
 
 def session_equations(
     problem: CalibrationProblem,
     linearisation: Linearisation,
-    vector: Vector,
     scales: Vector,
     pose_weights: Vector,
 ) -> list[SessionEquations]:
-    """Return the normal equations of each session at some unknowns."""
-    roots = np.sqrt(pose_weights)[problem.rows.pose]
-    errors = roots * linearisation.errors
-    jacobian = roots[:, None] * linearisation.jacobian
-    common = problem.common_columns
-    return [
-        _eliminate_frames(
-            errors[rows],
-            jacobian[np.ix_(rows, common)],
-            jacobian[np.ix_(rows, columns)],
-            vector[columns],
-            scales[columns],
-        )
-        for rows, columns in zip(
-            problem.session_rows, problem.session_columns, strict=True
-        )
-    ]
-
-
-def _eliminate_frames(
-    errors: Vector, jacobian: Matrix, by_frames: Matrix, frames: Vector, scales: Vector
-) -> SessionEquations:
-    """Return normal equations without the frames of a session.
+    """Return the equations of each session at some unknowns.
 
     Args:
-        errors: Errors of the session.
-        jacobian: Derivatives by the common unknowns.
-        by_frames: Derivatives by the frames.
-        frames: Corrections of the frames.
-        scales: Their prior deviations, in which their equations are solved.
+        problem: The problem.
+        linearisation: Errors and derivatives at these unknowns.
+        scales: Prior deviation of each unknown; frames without one stay.
+        pose_weights: Weight of each pose.
     """
-    columns = by_frames * scales
-    # The prior keeps what the poses of the session do not determine.
-    frame_matrix = np.eye(len(scales)) + columns.T @ columns
-    coupling = columns.T @ jacobian
-    frame_gradient = columns.T @ errors + divided(frames, scales)
-    right_sides = np.column_stack([coupling, frame_gradient])
-    solution = np.linalg.solve(frame_matrix, right_sides)
-    slopes = solution[:, :-1]
-    step = solution[:, -1]
-    return SessionEquations(
-        jacobian.T @ jacobian - coupling.T @ slopes,
-        jacobian.T @ errors - coupling.T @ step,
-        -scales[:, None] * slopes,
-        -scales * step,
-    )
+    is_measured = np.isfinite(problem.poses.deviations)
+    roots = np.sqrt(pose_weights)[:, None] * is_measured
+    equations = []
+    for session, columns in enumerate(problem.session_columns):
+        is_row = is_measured & (problem.poses.session == session)[:, None]
+        errors = roots[is_row] * linearisation.errors[is_row]
+        rows = roots[is_row][:, None] * linearisation.jacobian[is_row]
+        by_frames = rows[:, columns] * (scales[columns] > 0.0)
+        jacobian = rows[:, problem.common_columns]
+        inverse = np.linalg.pinv(by_frames, rcond=MIN_EFFECT)
+        step = -inverse @ errors
+        slopes = -inverse @ jacobian
+        equations.append(
+            SessionEquations(
+                errors + by_frames @ step,
+                jacobian + by_frames @ slopes,
+                step,
+                slopes,
+            )
+        )
+    return equations
+
+
+def normal_matrices(equations: list[SessionEquations]) -> np.ndarray:
+    """Return the second derivatives of half the sum of squares of each session."""
+    return np.stack([x.jacobian.T @ x.jacobian for x in equations])
 
 
 def common_step(
@@ -157,31 +142,21 @@ def common_step(
         scales: Their prior deviations; with leading axes for several priors.
         session_weights: Weight of each session; with leading axes for several.
     """
-    matrices = np.stack([x.matrix for x in equations])
-    gradients = np.stack([x.gradient for x in equations])
-    matrix = np.einsum("...s,sij->...ij", session_weights, matrices)
+    matrices = normal_matrices(equations)
+    gradients = np.stack([x.jacobian.T @ x.errors for x in equations])
+    matrix = np.tensordot(session_weights, matrices, 1)
     gradient = session_weights @ gradients
     # In units of the prior, which then is the identity.
-    scaled_matrix = scales[..., :, None] * matrix * scales[..., None, :]
-    system = np.eye(len(common)) + scaled_matrix
+    columns = matrix * scales[..., None, :]
+    scaled_matrix = scales[..., :, None] * columns
+    system = scaled_matrix + np.eye(len(common))
     right_side = scales * gradient + divided(common, scales)
-    return -scales * np.linalg.solve(system, right_side[..., None])[..., 0]
-
-
-def moved(
-    problem: CalibrationProblem,
-    equations: list[SessionEquations],
-    vector: Vector,
-    step: Vector,
-) -> Vector:
-    """Return all unknowns after a step of the common ones."""
-    end = vector.copy()
-    end[problem.common_columns] += step
-    for columns, x in zip(problem.session_columns, equations, strict=True):
-        end[columns] += x.frame_slopes @ step + x.frame_step
-    return end
+    solution = np.linalg.solve(system, right_side[..., None])
+    return -scales * solution[..., 0]
 
 
 def divided(values: np.ndarray, scales: np.ndarray) -> np.ndarray:
     """Return values in units of their scales; zero where the scale is zero."""
-    return np.where(scales > 0.0, values / np.where(scales > 0.0, scales, 1.0), 0.0)
+    has_scale = scales > 0.0
+    divisors = np.where(has_scale, scales, 1.0)
+    return np.where(has_scale, values / divisors, 0.0)

@@ -15,6 +15,7 @@ from .geometry_fit import GeometryFit
 from .observations import AbstractObservation
 from .problem import build_problem
 from .solution import solve
+from .wrong_robots import require_right_robot
 
 NO_MASSES = (
     "Compliance was left out, because the masses of the robot are not known: give "
@@ -49,23 +50,7 @@ def calibrate(
         InputError: If there is no observation, or they are too few; if coordinates do
             not fit the robot, or it has closed loops.
     """
-    if robot.loops:
-        raise InputError(
-            f"`robot` must be an open chain or tree, but `{robot.name}` has closed "
-            "loops: calibrate one of its arms (`tip`)."
-        )
-    if not observations:
-        raise InputError("`observations` must hold at least one observation.")
-    for observation in observations:
-        joints = observation.q.shape[1]
-        if observation.has_poses and joints != robot.joints:
-            raise InputError(
-                f"`q` of the session `{observation.session}` must have "
-                f"{robot.joints} columns, one for each joint of `{robot.name}`, but "
-                f"has {joints}."
-            )
-        if observation.has_poses:
-            require_radians(robot, observation)
+    _require_observations(robot, observations)
     parameters = None
     if compliance:
         parameters = _bodies_of_file(robot) if bodies is None else bodies
@@ -74,7 +59,7 @@ def calibrate(
         as_finite_array("`bodies`", numbers, (robot.bodies, 10))
         parameters = numbers
     problem = build_problem(robot, observations, parameters)
-    numbers_measured = len(problem.row_deviations)
+    numbers_measured = np.count_nonzero(np.isfinite(problem.poses.deviations))
     numbers_unknown = np.count_nonzero(problem.freedoms)
     if numbers_measured <= numbers_unknown:
         raise InputError(
@@ -82,6 +67,7 @@ def calibrate(
             f"of tools and places, but hold {numbers_measured}: record 20 to 30 poses "
             "in each place."
         )
+    require_right_robot(problem, observations)
     notes = (NO_MASSES,) if compliance and parameters is None else ()
     session_weights = np.ones(len(problem.sessions))
     has_compliance = parameters is not None
@@ -89,20 +75,40 @@ def calibrate(
     return GeometryFit(problem, solution, has_compliance, notes)
 
 
-def require_radians(robot: Robot, observation: AbstractObservation) -> None:
-    """Reject angles that are more than a turn outside the range of their joint."""
-    limits = robot.limits
-    below = limits.position_min - observation.q
-    above = observation.q - limits.position_max
-    excess = np.where(robot.revolute, np.maximum(below, above), 0.0)
-    pose, joint = np.unravel_index(np.argmax(excess), excess.shape)
-    if excess[pose, joint] > 2.0 * np.pi:
+def _require_observations(
+    robot: Robot, observations: Sequence[AbstractObservation]
+) -> None:
+    """Reject observations that cannot be those of the robot.
+
+    Such are angles that are more than a turn outside the range of their joint.
+    """
+    if robot.loops:
         raise InputError(
-            f"`q` of the session `{observation.session}` must hold joint angles in "
-            f"radians, but joint {joint + 1} is at {observation.q[pose, joint]:.4g}, "
-            f"more than a turn outside its range: are angles in degrees "
-            '(`angle_unit = "deg"` in the experiment file), or columns wrong?'
+            f"`robot` must be an open chain or tree, but `{robot.name}` has closed "
+            "loops: calibrate one of its arms (`tip`)."
         )
+    poses = [x for x in observations if x.has_poses]
+    if not poses:
+        raise InputError("`observations` must hold at least one observation of poses.")
+    limits = robot.limits
+    for observation in poses:
+        owner = f"`q` of the session `{observation.session}`"
+        q = observation.q
+        if q.shape[1] != robot.joints:
+            raise InputError(
+                f"{owner} must have {robot.joints} columns, one for each joint of "
+                f"`{robot.name}`, but has {q.shape[1]}."
+            )
+        excess = np.maximum(limits.position_min - q, q - limits.position_max)
+        is_far = (excess > 2.0 * np.pi) & np.array(robot.revolute)
+        if is_far.any():
+            pose, joint = np.argwhere(is_far)[0]
+            raise InputError(
+                f"{owner} must hold joint angles in radians, but "
+                f"`{robot.joint_names[joint]}` is at {q[pose, joint]:.4g}, more than a "
+                "turn outside its range: are angles in degrees "
+                '(`angle_unit = "deg"` in the experiment file), or columns wrong?'
+            )
 
 
 def _bodies_of_file(robot: Robot) -> BodyParameters | None:

@@ -4,6 +4,7 @@ from collections.abc import Iterator
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
+import scipy
 
 from jaxid.result_table import Remark, Status, significant, sort_remarks
 
@@ -11,7 +12,9 @@ if TYPE_CHECKING:
     from .geometry_fit import GeometryFit
 
 MAX_EXAMPLES = 5
-"""Number of poses or sessions that a sentence names."""
+"""Number of poses that a sentence names."""
+MIN_DISTANCES = 3
+"""Number of known distances below which they are not judged."""
 
 
 class FindingLimits(NamedTuple):
@@ -93,8 +96,8 @@ def _on_wrong_poses(fit: "GeometryFit") -> Iterator[Remark]:
         )
     ]
     yield Remark(
-        f"{len(poses)} of {np.count_nonzero(fit.problem.is_pose)} poses do not belong "
-        f"to the others and were left out: {'; '.join(examples)}",
+        f"{len(poses)} of {fit.problem.poses.is_pose.sum()} poses do not belong to the "
+        f"others and were left out: {'; '.join(examples)}",
         Status.DOUBTFUL,
     )
 
@@ -137,20 +140,23 @@ def _on_held_out_sessions(fit: "GeometryFit") -> Iterator[Remark]:
             f"{significant(1e3 * means[session])} mm; was something loose?",
             Status.DOUBTFUL,
         )
-    distances = fit.held_out.distances
-    outside = [x for x in distances if not x.is_inside]
-    if outside:
-        examples = [
-            f"{x.session} {significant(1e3 * x.error, 2)} ± "
-            f"{significant(1e3 * x.half_width, 2)} mm"
-            for x in outside[:MAX_EXAMPLES]
-        ]
-        yield Remark(
-            f"In {len(outside)} of {len(distances)} sessions that were held out, the "
-            "known distance is outside the interval of its prediction: "
-            f"{', '.join(examples)}",
-            Status.DOUBTFUL,
-        )
-    elif distances:
-        text = "Known distances are inside the intervals of their predictions"
-        yield Remark(f"{text} in all sessions, each held out", Status.GOOD)
+    yield from _on_known_distances(fit)
+
+
+def _on_known_distances(fit: "GeometryFit") -> Iterator[Remark]:
+    """Yield whether known distances are predicted in sessions that are held out."""
+    errors = 1e3 * fit.held_out.distances
+    if len(errors) < MIN_DISTANCES:
+        return
+    mean = errors.mean()
+    deviation = errors.std(ddof=1) / np.sqrt(len(errors))
+    half_width = scipy.special.stdtrit(len(errors) - 1, 0.975) * deviation
+    is_systematic = abs(mean) > half_width
+    text = (
+        "Known distances, in sessions held out, are predicted with a mean error of "
+        f"{significant(mean, 2)} ± {significant(half_width, 2)} mm (largest "
+        f"{significant(np.abs(errors).max(), 2)} mm)"
+    )
+    if is_systematic:
+        text += ": check the distance, and the unit of the robot's file"
+    yield Remark(text, Status.DOUBTFUL if is_systematic else Status.GOOD)

@@ -12,12 +12,11 @@ import numpy as np
 from jaxid.arrays import Indices, Matrix, Vector
 from jaxid.dynamics.rank import (
     gram_schmidt,
-    rank_by_singular_values,
     regrouping,
-    scale_columns,
 )
 from jaxid.robot.robot import Robot
 
+from .adjustment import session_equations
 from .problem import CalibrationProblem, Linearisation
 
 AXES = "xyz"
@@ -55,14 +54,13 @@ class Combinations(NamedTuple):
         leaders: Indices of the corrections after which the combinations are named.
         followers: Indices of the corrections that are part of combinations only.
         factors: Factor of each follower in each combination.
-        rank: Number of determined combinations by the singular values.
-        gap: Ratio of the singular values on both sides of the rank.
+        gap: Ratio of the share of the least independent column that no others explain
+            to the largest such share of the dependent ones.
     """
 
     leaders: Indices
     followers: Indices
     factors: Matrix
-    rank: int
     gap: float
 
     def of(self, values: np.ndarray) -> np.ndarray:
@@ -118,13 +116,11 @@ def determined_combinations(
             out.
     """
     common = problem.common_columns
-    blocks = []
-    for rows, columns in zip(
-        problem.session_rows, problem.session_columns, strict=True
-    ):
-        jacobian = linearisation.jacobian[rows] * scales
-        blocks.append(_without_frames(jacobian[:, common], jacobian[:, columns]))
-    columns = np.concatenate(blocks)
+    every_pose = np.ones(len(problem.poses.session))
+    equations = session_equations(problem, linearisation, scales, every_pose)
+    # In few rows, of the same rank.
+    blocks = [np.linalg.qr(x.jacobian, mode="r") for x in equations]
+    columns = np.concatenate(blocks) * scales[common]
 
     order = _order(problem.robot, len(common))
     order = order[scales[common][order] > 0.0]
@@ -138,21 +134,10 @@ def determined_combinations(
     # The factors are those of columns in units of the prior.
     units = scales[common]
     factors = regrouped.kappa * units[leaders][:, None] / units[followers]
-    rank = rank_by_singular_values(ordered_columns)
-    values = np.linalg.svd(scale_columns(ordered_columns)[0], compute_uv=False)
-    values = np.append(values, 0.0)
-    gap = values[rank - 1] / max(values[rank], np.finfo(float).eps * values[0])
+    gap = min(dependence.gap, 1.0 / MIN_SHARE**2)
     return Combinations(
-        tuple(leaders.tolist()), tuple(followers.tolist()), factors, rank, float(gap)
+        tuple(leaders.tolist()), tuple(followers.tolist()), factors, gap
     )
-
-
-def _without_frames(jacobian: Matrix, by_frames: Matrix) -> Matrix:
-    """Return what no motion of a session's own frames explains, in few rows."""
-    left, values, _ = np.linalg.svd(by_frames, full_matrices=False)
-    basis = left[:, values > 1e-9 * values.max(initial=0.0)]
-    remainder = jacobian - basis @ (basis.T @ jacobian)
-    return np.asarray(np.linalg.qr(remainder, mode="r"))
 
 
 def _order(robot: Robot, size: int) -> np.ndarray:

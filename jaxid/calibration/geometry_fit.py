@@ -5,9 +5,8 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-import scipy
 
-from jaxid.arrays import AnyArray, Texts, Vector, double_precision
+from jaxid.arrays import AnyArray, Texts, Vector
 from jaxid.errors import InputError
 from jaxid.identification.run_to_run import Run
 from jaxid.identification.uncertainty import Uncertainty
@@ -79,12 +78,7 @@ class GeometryFit(Summarised):
     @cached_property
     def robot(self) -> Robot:
         """The calibrated robot."""
-        nominal = self.problem.robot
-        with double_precision():
-            robot = corrected_robot(nominal, self.origins)
-            return nominal.replace(
-                offset=np.asarray(robot.offset), rotation=np.asarray(robot.rotation)
-            )
+        return corrected_robot(self.problem.robot, self.origins)
 
     @property
     def origins(self) -> np.ndarray:
@@ -92,12 +86,12 @@ class GeometryFit(Summarised):
 
         The part of a turn about the axis of its joint is the error of the joint's zero.
         """
-        return np.asarray(self._unknowns.origins)
+        return self._unknowns.origins
 
     @property
     def compliances(self) -> Vector:
         """Deflection of each joint by torque [rad/(N m) or m/N]."""
-        return np.asarray(self._unknowns.compliances)
+        return self._unknowns.compliances
 
     @property
     def _unknowns(self):
@@ -106,15 +100,9 @@ class GeometryFit(Summarised):
     @property
     def frames(self) -> dict[tuple[str, str], Frame]:
         """Tools on the end-effector (no session) and places, by session and name."""
-        problem = self.problem
-        starts = zip(*problem.starts, strict=True)
-        with double_precision():
-            frames = [
-                Frame(*start).corrected(correction)
-                for start, correction in zip(starts, self._unknowns.frames, strict=True)
-            ]
-        arrays = [Frame(*map(np.asarray, frame)) for frame in frames]
-        return dict(zip(problem.frame_keys, arrays, strict=True))
+        frames = self.problem.starts.corrected(self._unknowns.frames)
+        pairs = map(Frame, *frames)
+        return dict(zip(self.problem.frame_keys, pairs, strict=True))
 
     def deflections(self, q: AnyArray) -> np.ndarray:
         """Return how far gravity deflects the joints in some poses [rad or m].
@@ -196,7 +184,7 @@ class GeometryFit(Summarised):
 
     def mean_error(self, errors: ErrorSizes) -> float:
         """Return the mean length of the errors of all poses [m]."""
-        return float(errors.lengths[self.problem.is_pose].mean())
+        return float(errors.lengths[self.problem.poses.is_pose].mean())
 
     @cached_property
     def findings(self) -> list[Remark]:
@@ -226,7 +214,7 @@ class GeometryFit(Summarised):
         """Errors of sessions that are held out if there are enough, or of the fit."""
         if self.can_hold_out:
             return self.held_out
-        return HeldOutErrors(self.errors, self.nominal_errors, ())
+        return HeldOutErrors(self.errors, self.nominal_errors, np.zeros(0))
 
     @property
     def manner(self) -> str:
@@ -271,27 +259,25 @@ class GeometryFit(Summarised):
                 "but has other corrections."
             )
         combinations = self.combinations
-        other_flags = dict(
-            zip(other.combinations.leaders, other.is_determined, strict=True)
-        )
+        sure = set(np.array(other.combinations.leaders)[other.is_determined])
         rows = [
             row
             for row, leader in enumerate(combinations.leaders)
-            if self.is_determined[row] and other_flags.get(leader, False)
+            if self.is_determined[row] and leader in sure
         ]
-        own_variances, other_variances = (
-            np.diag(combinations.covariance(fit.covariances.scatter))
+        first, second = (
+            combinations.covariance(fit.covariances.scatter)[np.ix_(rows, rows)]
             for fit in (self, other)
         )
-        dof = dof_of_sum(own_variances, other_variances, self.dof, other.dof)
-        quantiles = scipy.special.stdtrit(dof, 0.975)
-        half_widths = quantiles * np.sqrt(own_variances + other_variances)
+        dof = dof_of_sum(np.diag(first), np.diag(second), self.dof, other.dof)
+        covariance = first + second
+        uncertainty = Uncertainty(covariance, dof, covariance)
         corrections = [self.corrections[combinations.leaders[row]] for row in rows]
         return GeometryChange(
             tuple(correction.words for correction in corrections),
             tuple(correction.unit for correction in corrections),
             combinations.of(other.values - self.values)[rows],
-            half_widths[rows],
+            uncertainty.half_widths(),
         )
 
     def bootstrap(self, draws: int = 1000, seed: int = 0) -> np.ndarray:

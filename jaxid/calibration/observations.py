@@ -1,21 +1,21 @@
 """Observations for kinematic calibration: measurements in poses of a robot.
 
 Each compares the `tool`, a point or frame on the end-effector, with a `place`, a point
-or frame in the room. Where both are is unknown.
+or frame in the room. Where both are is unknown. Measured are some of the six numbers of
+the tool's pose in the place: a ball in a socket is at zero, a camera measures all.
 """
 
 import abc
 import dataclasses
 from typing import Any, ClassVar
 
-import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers, as_array
+from jaxid.arrays import Float, Numbers, as_array
 from jaxid.errors import InputError
 from jaxid.robot.robot import as_rotations
 
-from .frames import SHIFT, TURN, Frame, rotation_errors
+from .frames import ORIGIN, SHIFT, TURN, Frame
 from .place_estimates import (
     centre_of_distances,
     nearest_frame,
@@ -27,7 +27,6 @@ Freedoms = tuple[int, ...]
 """Numbers of a correction that move a frame; the others do not matter."""
 FrameKey = tuple[str, str]
 """Session and name of an unknown frame; no session if it is the same in all."""
-PLANE: Freedoms = (2, 3, 4)
 FRAME: Freedoms = (*SHIFT, *TURN)
 POINT: Freedoms = SHIFT
 
@@ -50,8 +49,9 @@ class AbstractObservation(abc.ABC):
 
     tool_freedoms: ClassVar[Freedoms] = POINT
     place_freedoms: ClassVar[Freedoms] = POINT
-    errors_of_lengths: ClassVar[int] = 3
-    errors_of_angles: ClassVar[int] = 0
+    measured_numbers: ClassVar[Freedoms] = POINT
+    measurements: ClassVar[dict[str, Freedoms]] = {}
+    is_distance: ClassVar[bool] = False
     has_poses: ClassVar[bool] = True
 
     session: str
@@ -77,6 +77,19 @@ class AbstractObservation(abc.ABC):
                 f"`deviation` must be positive, but is {self.deviation:g}."
             )
         object.__setattr__(self, "q", q)
+        for name, size in self.measurements.items():
+            self._set_measurement(name, (len(q), *size))
+
+    def _set_measurement(self, name: str, shape: tuple[int, ...]) -> None:
+        """Check measurements, of which each pose has its own or all the same."""
+        array = np.asarray(as_array(name, getattr(self, name)), np.float64)
+        if array.shape not in (shape, shape[1:]) or not np.isfinite(array).all():
+            raise InputError(
+                f"`{name}` of the session `{self.session}` must hold finite numbers "
+                f"in the shape {shape}, one row for each pose, but has the shape "
+                f"{array.shape}."
+            )
+        object.__setattr__(self, name, np.broadcast_to(array, shape))
 
     @property
     def tool_key(self) -> FrameKey:
@@ -89,39 +102,20 @@ class AbstractObservation(abc.ABC):
         return "" if self.place_stays else self.session, self.place
 
     @property
-    def deviations(self) -> Float[np.ndarray, " errors"]:
-        """Standard deviation of each error of a pose."""
-        return np.full(self.errors_of_lengths, self.deviation)
+    def deviations(self) -> Float[np.ndarray, "6"]:
+        """Standard deviations of a pose's numbers; infinite if they are not measured.
 
-    def measured_numbers(
-        self, name: str, value: Numbers, size: tuple[int, ...]
-    ) -> np.ndarray:
-        """Return measurements with a row for each pose, or raise an error."""
-        array = np.asarray(as_array(name, value), np.float64)
-        shape = (len(self.q), *size)
-        if array.shape != shape or not np.isfinite(array).all():
-            raise InputError(
-                f"`{name}` of the session `{self.session}` must hold finite numbers "
-                f"in the shape {shape}, one row for each pose, but has the shape "
-                f"{array.shape}."
-            )
-        return array
+        A distance is the first number.
+        """
+        deviations = np.full(6, np.inf)
+        deviations[list(self.measured_numbers)] = self.deviation
+        return deviations
 
     @property
-    @abc.abstractmethod
-    def measured(self) -> Float[np.ndarray, "poses numbers"]:
-        """Measurements of each pose."""
-
-    @staticmethod
-    @abc.abstractmethod
-    def errors(tool: Frame, place: Frame, measured: AnyArray) -> AnyArray:
-        """Return the errors of one pose: lengths [m], then angles [rad].
-
-        Args:
-            tool: Tool on the ground.
-            place: Place on the ground.
-            measured: Measurements of this pose.
-        """
+    def measured(self) -> Frame:
+        """Measured poses of the tool in the place; zero where it is in contact."""
+        poses = len(self.q)
+        return Frame(np.tile(np.eye(3), (poses, 1, 1)), np.zeros((poses, 3)))
 
     @abc.abstractmethod
     def first_estimates(self, tips: Frame) -> tuple[Frame, Frame]:
@@ -136,19 +130,21 @@ class AbstractObservation(abc.ABC):
 class PointContact(AbstractObservation):
     """A point of the tool stays at one point of the room, like a ball in a socket."""
 
-    @property
-    def measured(self):
-        """No numbers."""
-        return np.zeros((len(self.q), 0))
-
-    @staticmethod
-    def errors(tool, place, measured):
-        """Return the vector from the place to the tool."""
-        return tool.position - place.position
-
     def first_estimates(self, tips):
         """Return the end-effector, and the mean of its positions."""
         return ORIGIN, Frame(np.eye(3), tips.position.mean(axis=0))
+
+
+@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
+class PlaneContact(AbstractObservation):
+    """A point of the tool lies in a plane, like a probe on a granite plate."""
+
+    place_freedoms: ClassVar[Freedoms] = (2, 3, 4)
+    measured_numbers: ClassVar[Freedoms] = (2,)
+
+    def first_estimates(self, tips):
+        """Return the end-effector, and the plane nearest to its positions."""
+        return ORIGIN, nearest_plane(tips.position)
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -159,30 +155,19 @@ class KnownDistance(AbstractObservation):
         distance: Distance in each pose, or in all [m].
     """
 
-    errors_of_lengths: ClassVar[int] = 1
+    measured_numbers: ClassVar[Freedoms] = (0,)
+    is_distance: ClassVar[bool] = True
+    measurements: ClassVar[dict[str, Freedoms]] = {"distance": ()}
     distance: Numbers
-
-    def __post_init__(self):
-        super().__post_init__()
-        distances = np.broadcast_to(self.distance, len(self.q))
-        numbers = self.measured_numbers("distance", distances, ())
-        object.__setattr__(self, "distance", numbers)
 
     @property
     def measured(self):
-        """Distances [m]."""
-        return np.asarray(self.distance)[:, None]
-
-    @staticmethod
-    def errors(tool, place, measured):
-        """Return how much the distance is too long."""
-        ray = tool.position - place.position
-        return jnp.sqrt(jnp.sum(ray * ray))[None] - measured
+        """Points at these distances along the first axis."""
+        return super().measured._replace(position=np.outer(self.distance, np.eye(3)[0]))
 
     def first_estimates(self, tips):
         """Return the end-effector, and the point with these distances from it."""
-        positions = np.asarray(tips.position)
-        centre = centre_of_distances(positions, np.asarray(self.distance))
+        centre = centre_of_distances(tips.position, np.asarray(self.distance))
         return ORIGIN, Frame(np.eye(3), centre)
 
 
@@ -210,28 +195,6 @@ class SocketDistance(KnownDistance):
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
-class PlaneContact(AbstractObservation):
-    """A point of the tool lies in a plane, like a probe on a granite plate."""
-
-    place_freedoms: ClassVar[Freedoms] = PLANE
-    errors_of_lengths: ClassVar[int] = 1
-
-    @property
-    def measured(self):
-        """No numbers."""
-        return np.zeros((len(self.q), 0))
-
-    @staticmethod
-    def errors(tool, place, measured):
-        """Return the height above the plane."""
-        return (place.inverse @ tool).position[2:]
-
-    def first_estimates(self, tips):
-        """Return the end-effector, and the plane nearest to its positions."""
-        return ORIGIN, nearest_plane(np.asarray(tips.position))
-
-
-@dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
 class MeasuredPosition(AbstractObservation):
     """An instrument, such as a laser tracker, measures a point of the tool.
 
@@ -242,26 +205,17 @@ class MeasuredPosition(AbstractObservation):
     """
 
     place_freedoms: ClassVar[Freedoms] = FRAME
+    measurements: ClassVar[dict[str, Freedoms]] = {"positions": (3,)}
     positions: Numbers
-
-    def __post_init__(self):
-        super().__post_init__()
-        numbers = self.measured_numbers("positions", self.positions, (3,))
-        object.__setattr__(self, "positions", numbers)
 
     @property
     def measured(self):
-        """Positions [m]."""
-        return np.asarray(self.positions)
-
-    @staticmethod
-    def errors(tool, place, measured):
-        """Return the vector from the measured position, along the instrument's axes."""
-        return (place.inverse @ tool).position - measured
+        """Positions, without attitudes."""
+        return super().measured._replace(position=np.asarray(self.positions))
 
     def first_estimates(self, tips):
         """Return the end-effector, and the frame that suits its positions best."""
-        return ORIGIN, nearest_frame(np.asarray(tips.position), self.measured)
+        return ORIGIN, nearest_frame(tips.position, np.asarray(self.positions))
 
 
 @dataclasses.dataclass(frozen=True, eq=False, kw_only=True)
@@ -281,7 +235,11 @@ class MeasuredPose(AbstractObservation):
 
     tool_freedoms: ClassVar[Freedoms] = FRAME
     place_freedoms: ClassVar[Freedoms] = FRAME
-    errors_of_angles: ClassVar[int] = 3
+    measured_numbers: ClassVar[Freedoms] = FRAME
+    measurements: ClassVar[dict[str, Freedoms]] = {
+        "positions": (3,),
+        "rotations": (3, 3),
+    }
     deviation: float = 1e-3
     rotations: Numbers
     positions: Numbers
@@ -289,11 +247,7 @@ class MeasuredPose(AbstractObservation):
 
     def __post_init__(self):
         super().__post_init__()
-        rotations = self.measured_numbers("rotations", self.rotations, (3, 3))
-        as_rotations("`rotations`", rotations, rotations.shape)
-        positions = self.measured_numbers("positions", self.positions, (3,))
-        object.__setattr__(self, "rotations", rotations)
-        object.__setattr__(self, "positions", positions)
+        as_rotations("`rotations`", self.rotations, np.shape(self.rotations))
 
     @classmethod
     def eye_in_hand(cls, session, q, *, rotations, positions, **fields):
@@ -306,16 +260,10 @@ class MeasuredPose(AbstractObservation):
             positions: Measured positions of the board in the camera [m].
             fields: Further attributes.
         """
-        board = Frame(
-            as_array("rotations", rotations), as_array("positions", positions)
-        )
-        camera = board.inverse
-        return cls(
-            session,
-            q,
-            rotations=camera.rotation,
-            positions=camera.position,
-            **fields,
+        board = cls(session, q, rotations=rotations, positions=positions, **fields)
+        camera = board.measured.inverse
+        return dataclasses.replace(
+            board, rotations=camera.rotation, positions=camera.position
         )
 
     @property
@@ -325,26 +273,14 @@ class MeasuredPose(AbstractObservation):
 
     @property
     def measured(self):
-        """Positions and entries of the attitudes."""
-        rotations = np.asarray(self.rotations).reshape(-1, 9)
-        return np.concatenate([np.asarray(self.positions), rotations], axis=1)
-
-    @staticmethod
-    def errors(tool, place, measured):
-        """Return the difference of positions and attitudes, along the place's axes."""
-        seen = place.inverse @ tool
-        measured_rotation = measured[3:].reshape(3, 3)
-        turn = rotation_errors(seen.rotation @ measured_rotation.T)
-        return jnp.concatenate([seen.position - measured[:3], turn])
+        """Attitudes and positions."""
+        return Frame(np.asarray(self.rotations), np.asarray(self.positions))
 
     def first_estimates(self, tips):
         """Return tool and place for which measured poses suit those of the tips."""
-        measured = Frame(np.asarray(self.rotations), np.asarray(self.positions))
-        return tool_and_place(tips, measured)
+        return tool_and_place(tips, self.measured)
 
 
-ORIGIN = Frame(np.eye(3), np.zeros(3))
-"""A frame that has not moved."""
 OBSERVATIONS: dict[str, type[AbstractObservation]] = {
     "point_contact": PointContact,
     "known_distance": KnownDistance,

@@ -2,14 +2,13 @@
 
 import numpy as np
 
-from jaxid.arrays import Float, Matrix, Matrix3, Vector, Vector3
+from jaxid.arrays import Matrix3, Vector, Vector3
+from jaxid.robot.rotations import Vectors
 
 from .frames import Frame
 
-Points = Float[np.ndarray, "poses 3"]
 
-
-def centre_of_distances(points: Points, distances: Vector) -> Vector3:
+def centre_of_distances(points: Vectors, distances: Vector) -> Vector3:
     """Return the point that has these distances from points, as nearly as possible."""
     middle = points.mean(axis=0)
     rays = points - middle
@@ -19,7 +18,7 @@ def centre_of_distances(points: Points, distances: Vector) -> Vector3:
     return middle + solution[:3]
 
 
-def nearest_plane(points: Points) -> Frame:
+def nearest_plane(points: Vectors) -> Frame:
     """Return a frame in the plane that points lie near; its z axis is the normal."""
     middle = points.mean(axis=0)
     _, _, axes = np.linalg.svd(points - middle, full_matrices=False)
@@ -28,7 +27,7 @@ def nearest_plane(points: Points) -> Frame:
     return Frame(rotation, middle)
 
 
-def nearest_frame(points: Points, measured: Points) -> Frame:
+def nearest_frame(points: Vectors, measured: Vectors) -> Frame:
     """Return the frame of an instrument whose measured points lie near the points."""
     middle = points.mean(axis=0)
     measured_middle = measured.mean(axis=0)
@@ -36,7 +35,7 @@ def nearest_frame(points: Points, measured: Points) -> Frame:
     return Frame(rotation, middle - rotation @ measured_middle)
 
 
-def nearest_rotation(matrix: Matrix) -> Matrix3:
+def nearest_rotation(matrix: Matrix3) -> Matrix3:
     """Return the rotation that is nearest to a matrix."""
     left, _, right = np.linalg.svd(matrix)
     handedness = np.linalg.det(left @ right)

@@ -4,6 +4,7 @@ import dataclasses
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from jaxid.arrays import Matrix, Vector, double_precision
 from jaxid.errors import InputError
@@ -11,19 +12,17 @@ from jaxid.robot.collision import CollisionModel
 from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.limits_and_drives import complete_limits
 
-from .adjustment import session_equations
-from .corrections import common_corrections
-from .frames import Frame, stacked
+from .adjustment import normal_matrices, session_equations
+from .frames import Frame
 from .geometry_fit import GeometryFit
-from .observations import AbstractObservation
-from .problem import CalibrationProblem, build_problem
+from .problem import CalibrationProblem, gravity_torques
 
 POSTURE_SPREAD = 0.25
 """Deviation of proposed poses from the posture of their session, in half ranges."""
-MIN_SHARE = 0.5
-"""Share of the asked poses that a place must allow."""
 MAX_ERROR = 1e-6
 """Largest error of a pose that reaches its place [m]."""
+SPARE_POSES = 2
+"""Random poses for each that is asked; not all can be taken."""
 
 
 class ProposedSession(NamedTuple):
@@ -31,31 +30,28 @@ class ProposedSession(NamedTuple):
 
     q: np.ndarray  # joint coordinates [rad or m]
     position: Vector  # mean position of the end-effector [m]
-    narrowing: float  # mean decrease of the deviations by this session (0 to 1)
+    narrowing: float  # mean decrease of the intervals by this session (0 to 1)
 
 
 def propose_sessions(
     fit: GeometryFit,
-    kind: type[AbstractObservation],
     *,
-    sessions: int = 4,
+    sessions: int = 3,
     poses: int = 20,
-    candidates: int = 60,
+    candidates: int = 40,
     collision: CollisionModel | None = None,
     distance: float = 0.03,
     seed: int = 0,
 ) -> list[ProposedSession]:
     """Return sessions that determine best what the present ones leave open.
 
-    Places are drawn at random within the limits of the joints; at each, the robot takes
-    poses in which the tool stays in place. Greedily, the session is taken that
-    decreases the deviations of all combinations most. When the next one decreases them
-    little, more sessions do not pay.
+    They measure what the first session measures. Places are drawn at random within the
+    limits of the joints; where the tool is in contact, it stays in its place in all
+    poses. Greedily, the session is taken that narrows the intervals of all combinations
+    most. When the next one narrows them little, more sessions do not pay.
 
     Args:
         fit: Calibration so far.
-        kind: Kind of the observations, like `jid.calibration.PointContact`; only those
-            without measured numbers.
         sessions: Number of sessions to propose.
         poses: Number of poses in each.
         candidates: Number of random places.
@@ -64,31 +60,29 @@ def propose_sessions(
         seed: Seed of the random places.
 
     Raises:
-        InputError: If no place can be reached in different postures.
+        InputError: If no place can be reached in so many postures.
     """
     rng = np.random.default_rng(seed)
-    proposals = []
-    matrices = []
+    drafts = []
     for _ in range(candidates):
-        q = _reachable_poses(fit, kind, poses, rng, collision, distance)
-        if len(q) >= MIN_SHARE * poses:
-            proposals.append(q)
-            matrices.append(_information(fit, kind, q))
-    if not proposals:
+        problem = _reachable_session(fit, poses, rng, collision, distance)
+        if len(problem.poses.q) == poses:
+            drafts.append(problem)
+    if not drafts:
         raise InputError(
-            "no place was found that the tool can reach in different postures: raise "
-            "`candidates`, or make room for the robot (`collision`)."
+            f"no place was found that the tool can reach in {poses} postures: ask for "
+            "fewer `poses`, or make room for the robot (`collision`)."
         )
-    return _best_sessions(fit, proposals, np.stack(matrices), sessions)
+    return _best_sessions(fit, drafts, sessions)
 
 
 def _best_sessions(
-    fit: GeometryFit, proposals: list[np.ndarray], matrices: np.ndarray, count: int
+    fit: GeometryFit, drafts: list[CalibrationProblem], count: int
 ) -> list[ProposedSession]:
     """Return the sessions that narrow the intervals most, one after the other."""
     scales = fit.solution.scales[fit.problem.common_columns]
-    equations = fit.solution.adjustment.equations
-    matrix = np.sum([x.matrix for x in equations], axis=0)
+    matrix = normal_matrices(fit.solution.adjustment.equations).sum(axis=0)
+    matrices = [_information(problem) for problem in drafts]
 
     def log_deviations(matrix: Matrix) -> Vector:
         system = np.eye(len(scales)) + scales[:, None] * matrix * scales
@@ -96,27 +90,29 @@ def _best_sessions(
         return 0.5 * np.log(np.diag(fit.combinations.covariance(covariance)))
 
     best_sessions = []
-    for _ in range(min(count, len(matrices))):
+    for number in range(min(count, len(drafts))):
         before = log_deviations(matrix)
-        gains = [float(np.mean(before - log_deviations(matrix + x))) for x in matrices]
+        gains = [np.mean(before - log_deviations(matrix + x)) for x in matrices]
         best = int(np.argmax(gains))
-        matrix = matrix + matrices[best]
-        matrices = np.delete(matrices, best, axis=0)
-        q = proposals.pop(best)
+        matrix = matrix + matrices.pop(best)
+        q = drafts.pop(best).poses.q
+        # More sessions also say better how much sessions scatter.
+        dof = max(fit.dof, 1) + np.array([number, number + 1])
+        before_quantile, quantile = scipy.special.stdtrit(dof, 0.975)
+        share = np.exp(-gains[best]) * quantile / before_quantile
         position = tip_jacobian(fit.robot, q).position.mean(axis=0)
-        best_sessions.append(ProposedSession(q, position, 1.0 - np.exp(-gains[best])))
+        best_sessions.append(ProposedSession(q, position, float(1.0 - share)))
     return best_sessions
 
 
-def _reachable_poses(
+def _reachable_session(
     fit: GeometryFit,
-    kind: type[AbstractObservation],
     poses: int,
     rng: np.random.Generator,
     collision: CollisionModel | None,
     distance: float,
-) -> np.ndarray:
-    """Return poses around a random posture that the robot can take at one place."""
+) -> CalibrationProblem:
+    """Return a session of poses around a random posture that the robot can take."""
     robot = fit.robot
     limits = complete_limits(robot)
     low = np.asarray(limits.position_min)
@@ -124,51 +120,69 @@ def _reachable_poses(
     middle = 0.5 * (high + low)
     half_range = 0.5 * (high - low)
     posture = middle + 0.8 * half_range * rng.uniform(-1.0, 1.0, robot.joints)
-    spread = POSTURE_SPREAD * half_range * rng.normal(size=(poses, robot.joints))
-    problem = _problem_at(fit, kind, posture, posture + spread)
+    shape = (SPARE_POSES * poses, robot.joints)
+    q = posture + POSTURE_SPREAD * half_range * rng.normal(size=shape)
+    problem = _session_at(fit, posture, q)
     nominal = problem.nominal.vector
-    exact = problem.without_errors(nominal)
-    errors = problem.error_sizes(exact.linearise(nominal).errors)
-    q = exact.groups[kind].q
-    is_possible = errors.lengths < MAX_ERROR
+    if _is_contact(fit):
+        problem = problem.without_errors(nominal)
+        errors = problem.error_sizes(problem.pose_errors(nominal).values)
+        is_possible = errors.lengths < MAX_ERROR
+    else:
+        is_possible = np.ones(len(q), bool)
+    q = problem.poses.q
     is_possible &= np.all(np.abs(q - middle) <= half_range, axis=1)
     if collision is not None:
         with double_precision():
             gaps = np.asarray(collision.clearance(robot, q))
         is_possible &= gaps.reshape(len(q), -1).min(axis=1) >= distance
-    return np.asarray(q)[is_possible]
+    best = q[is_possible][:poses]
+    return _session_at(fit, posture, best)
 
 
-def _problem_at(
-    fit: GeometryFit, kind: type[AbstractObservation], posture: Vector, q: np.ndarray
-) -> CalibrationProblem:
-    """Return a problem whose place is where the tool is in a posture."""
-    tools = [frame for (session, _), frame in fit.frames.items() if not session]
-    tool = tools[0]
-    name = next(name for session, name in fit.frames if not session)
+def _is_contact(fit: GeometryFit) -> bool:
+    """Return whether poses of the first place measure the same, as contacts do."""
+    poses = fit.problem.poses
+    is_first = poses.is_pose & (poses.place == poses.place[0])
+    positions = poses.measured.position[is_first]
+    return bool(np.all(positions == positions[0]))
+
+
+def _session_at(fit: GeometryFit, posture: Vector, q: np.ndarray) -> CalibrationProblem:
+    """Return a session like the first one, whose tool is in place in a posture."""
+    first = fit.problem.poses
+    fields = {
+        field.name: getattr(first, field.name) for field in dataclasses.fields(first)
+    }
+    measured = fields.pop("measured").at(np.zeros(len(q), int))
+    repeated = {name: np.repeat(x[:1], len(q), axis=0) for name, x in fields.items()}
+    repeated |= {"q": q, "torques": gravity_torques(fit.robot, fit.problem.bodies, q)}
+    frames = fit.frames
+    keys = fit.problem.frame_keys
+    tool = frames[keys[first.tool[0]]]
+    starts = [frames[key] for key in keys]
     tip = tip_jacobian(fit.robot, posture[None])
-    place = Frame(tip.rotation[0], tip.position[0]) @ tool
-    problem = build_problem(
-        fit.robot, [kind("proposed", q, tool=name)], fit.problem.bodies
+    tool_position = (Frame(tip.rotation[0], tip.position[0]) @ tool).position
+    place = starts[first.place[0]]
+    lever = place.rotation @ first.measured.position[0]
+    starts[first.place[0]] = place._replace(position=tool_position - lever)
+    problem = dataclasses.replace(
+        fit.problem,
+        robot=fit.robot,
+        starts=Frame(*map(np.stack, zip(*starts, strict=True))),
     )
-    level_place = Frame(np.eye(3), place.position)
-    starts = [tool if not session else level_place for session, _ in problem.frame_keys]
-    return dataclasses.replace(problem, starts=stacked(starts))
+    return problem.with_poses(measured=measured, **repeated)
 
 
-def _information(
-    fit: GeometryFit, kind: type[AbstractObservation], q: np.ndarray
-) -> Matrix:
-    """Return second derivatives by the common unknowns of the fit from some poses."""
-    problem = _problem_at(fit, kind, q[0], q)
+def _information(problem: CalibrationProblem) -> Matrix:
+    """Return second derivatives by the common unknowns from the poses of a session."""
     nominal = problem.nominal.vector
-    scales = problem.nominal._replace(frames=problem.freedoms.astype(float)).vector
-    weights = np.ones(len(problem.pose_sessions))
-    (equations,) = session_equations(
-        problem, problem.linearise(nominal), nominal, scales, weights
+    # An instrument will measure what it sees then.
+    exact = problem.with_poses(measured=problem.pose_errors(nominal).seen)
+    equations = session_equations(
+        exact,
+        exact.linearise(nominal),
+        problem.frame_scales,
+        np.ones(len(problem.poses.session)),
     )
-    numbers = {x: k for k, x in enumerate(fit.corrections)}
-    places = [numbers[x] for x in common_corrections(problem)]
-    matrix = np.zeros((len(numbers), len(numbers)))
-    matrix[np.ix_(places, places)] = equations.matrix
-    return matrix
+    return normal_matrices(equations).sum(axis=0)

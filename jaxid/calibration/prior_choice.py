@@ -7,9 +7,9 @@ import numpy as np
 
 from jaxid.arrays import Vector
 
-from .adjustment import SessionEquations, Weights, common_step, session_equations
+from .adjustment import Weights, common_step, session_equations
 from .error_derivatives import Unknowns
-from .problem import CalibrationProblem, Linearisation
+from .problem import CalibrationProblem
 from .wrong_poses import pose_sizes
 
 SLIDE_FACTOR = 0.1
@@ -69,44 +69,25 @@ def choose_prior(
     At this point the problem is linear enough: each prior is one solution of the
     equations at the unknowns.
     """
-    scales = np.stack([prior_scales(problem, x, has_compliance) for x in PRIORS])
-    linearisation = problem.linearise(vector)
-    equations = session_equations(
-        problem, linearisation, vector, scales[0], weights.poses
-    )
-    sessions = np.flatnonzero(weights.sessions).tolist()
+    sessions = np.flatnonzero(weights.sessions)
     if len(sessions) < 2:
         return MIDDLE_PRIOR
+    scales = np.stack([prior_scales(problem, x, has_compliance) for x in PRIORS])
+    linearisation = problem.linearise(vector)
+    equations = session_equations(problem, linearisation, scales[0], weights.poses)
     common = problem.common_columns
     totals = np.zeros(len(PRIORS))
     for session in sessions:
         other_weights = weights.sessions.copy()
         other_weights[session] = 0.0
         steps = common_step(equations, vector[common], scales[:, common], other_weights)
-        totals += [
-            _mean_size(problem, linearisation, equations, session, step, weights.poses)
-            for step in steps
-        ]
+        own_equations = equations[session]
+        poses = problem.poses.session == session
+        deviations = problem.poses.deviations[poses]
+        errors = np.zeros((len(PRIORS), *deviations.shape))
+        rows = own_equations.errors + steps @ own_equations.jacobian.T
+        errors[:, np.isfinite(deviations)] = rows
+        sizes = pose_sizes(errors, deviations)
+        is_counted = problem.poses.is_pose[poses] * weights.poses[poses]
+        totals += np.average(sizes, weights=is_counted, axis=1)
     return PRIORS[int(np.argmin(totals))]
-
-
-def _mean_size(
-    problem: CalibrationProblem,
-    linearisation: Linearisation,
-    equations: list[SessionEquations],
-    session: int,
-    step: Vector,
-    pose_weights: Vector,
-) -> float:
-    """Return the mean size of a session's errors after a step of the others."""
-    session_equations = equations[session]
-    columns = problem.session_columns[session]
-    frame_step = session_equations.frame_slopes @ step
-    frame_step = frame_step + session_equations.frame_step
-    jacobian = linearisation.jacobian
-    changes = (
-        jacobian[:, problem.common_columns] @ step + jacobian[:, columns] @ frame_step
-    )
-    sizes = pose_sizes(problem, linearisation.errors + changes)
-    is_counted = problem.is_pose & (problem.pose_sessions == session)
-    return float(np.average(sizes[is_counted], weights=pose_weights[is_counted]))

@@ -6,14 +6,13 @@ of gravity, for which rough masses suffice.
 """
 
 import dataclasses
-import math
 from collections.abc import Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float, Vector, double_precision
+from jaxid.arrays import Float, Vector
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import RigidBodies
 from jaxid.program.sample_methods import in_numpy
@@ -21,12 +20,10 @@ from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.inertia import BodyParameters
 from jaxid.robot.robot import Robot
 
-from .error_derivatives import Kind, PoseErrors, Poses, Unknowns, pose_errors
-from .frames import Frame, stacked
+from .error_derivatives import PoseErrors, Poses, Unknowns, pose_errors
+from .frames import Frame
 from .observations import AbstractObservation, FrameKey
 
-BLOCK = 64
-"""Poses are computed in multiples of this number, so that few programs are compiled."""
 NEWTON_STEPS = 5
 """Steps to coordinates without errors, which double the digits."""
 
@@ -34,8 +31,8 @@ NEWTON_STEPS = 5
 class Linearisation(NamedTuple):
     """Errors in units of their deviations, and derivatives by all unknowns."""
 
-    errors: Float[np.ndarray, " rows"]
-    jacobian: Float[np.ndarray, "rows unknowns"]
+    errors: Float[np.ndarray, "poses 6"]
+    jacobian: Float[np.ndarray, "poses 6 unknowns"]
 
 
 class ErrorSizes(NamedTuple):
@@ -43,13 +40,6 @@ class ErrorSizes(NamedTuple):
 
     lengths: Vector  # [m]
     angles: Vector  # [rad]; NaN where no angles were measured
-
-
-class Rows(NamedTuple):
-    """Origin of each row of a linearisation."""
-
-    session: np.ndarray  # index of its session
-    pose: np.ndarray  # index of its pose, in the order of the groups
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -62,7 +52,7 @@ class CalibrationProblem:
         frame_keys: Session and name of each unknown frame.
         starts: First estimates of the frames.
         freedoms: For each frame which numbers of its correction are unknown.
-        groups: Poses of each kind of observation.
+        poses: Poses of all observations.
         bodies: Inertial parameters of the bodies; None if joints do not deflect.
     """
 
@@ -71,7 +61,7 @@ class CalibrationProblem:
     frame_keys: tuple[FrameKey, ...]
     starts: Frame
     freedoms: np.ndarray
-    groups: dict[Kind, Poses]
+    poses: Poses
     bodies: BodyParameters | None
 
     @property
@@ -83,67 +73,25 @@ class CalibrationProblem:
             np.zeros((len(self.frame_keys), 6)),
         )
 
-    @cached_property
-    def rows(self) -> Rows:
-        """Session and pose of each row."""
-        sessions = []
-        poses = []
-        first_pose = 0
-        for group in self.groups.values():
-            count, errors = group.deviations.shape
-            sessions.append(np.repeat(group.session, errors))
-            poses.append(np.repeat(first_pose + np.arange(count), errors))
-            first_pose += count
-        return Rows(np.concatenate(sessions), np.concatenate(poses))
-
-    @cached_property
-    def row_deviations(self) -> np.ndarray:
-        """Standard deviation of the error of each row [m or rad]."""
-        return np.concatenate([x.deviations.ravel() for x in self.groups.values()])
-
-    @cached_property
-    def pose_sessions(self) -> np.ndarray:
-        """Index of the session of each pose."""
-        return np.concatenate([group.session for group in self.groups.values()])
-
-    @cached_property
-    def is_pose(self) -> np.ndarray:
-        """For each pose whether it is one, and no distance of two places."""
-        return np.concatenate(
-            [
-                np.full(len(group.q), kind.has_poses)
-                for kind, group in self.groups.items()
-            ]
-        )
+    @property
+    def frame_scales(self) -> Vector:
+        """Scales of unknowns that leave the geometry nominal."""
+        return self.nominal._replace(frames=self.freedoms.astype(float)).vector
 
     @property
     def poses_of_sessions(self) -> list[np.ndarray]:
         """Indices of the poses of each session."""
+        is_pose = self.poses.is_pose
         return [
-            np.flatnonzero(self.is_pose & (self.pose_sessions == session))
-            for session in range(len(self.sessions))
-        ]
-
-    @cached_property
-    def session_rows(self) -> list[np.ndarray]:
-        """Rows of each session."""
-        return [
-            np.flatnonzero(self.rows.session == session)
+            np.flatnonzero(is_pose & (self.poses.session == session))
             for session in range(len(self.sessions))
         ]
 
     @cached_property
     def session_columns(self) -> list[np.ndarray]:
         """Columns of the frames that belong to each session alone."""
-        columns = self.frame_columns
-        owners = [owner for owner, _ in self.frame_keys]
-        return [
-            np.concatenate(
-                [columns[k] for k, owner in enumerate(owners) if owner == session]
-                or [np.zeros(0, int)]
-            )
-            for session in self.sessions
-        ]
+        owners = np.array([owner for owner, _ in self.frame_keys])
+        return [self.frame_columns[owners == name].ravel() for name in self.sessions]
 
     @property
     def frame_columns(self) -> np.ndarray:
@@ -161,45 +109,47 @@ class CalibrationProblem:
     @property
     def pose_names(self) -> list[str]:
         """Session, place and number of each pose."""
-        names = []
-        for group in self.groups.values():
+        poses = self.poses
+        return [
+            f"{self.sessions[session]}, {self.frame_keys[place][1]}, pose {number}"
             for session, place, number in zip(
-                group.session, group.place, group.number, strict=True
-            ):
-                _, place_name = self.frame_keys[place]
-                names.append(f"{self.sessions[session]}, {place_name}, pose {number}")
-        return names
+                poses.session, poses.place, poses.number, strict=True
+            )
+        ]
 
-    def error_sizes(self, errors: Vector) -> ErrorSizes:
+    def error_sizes(self, errors: Float[np.ndarray, "poses 6"]) -> ErrorSizes:
         """Return the lengths and angles of the errors of each pose.
 
         Args:
             errors: Errors in units of their deviations.
         """
-        lengths = []
-        angles = []
-        first_row = 0
-        for kind, group in self.groups.items():
-            rows = first_row + np.arange(group.deviations.size)
-            first_row += len(rows)
-            values = errors[rows].reshape(group.deviations.shape) * group.deviations
-            length_part, sines = np.split(values, [kind.errors_of_lengths], axis=1)
-            lengths.append(np.linalg.norm(length_part, axis=1))
-            sine = np.minimum(np.linalg.norm(sines, axis=1), 1.0)
-            angle = np.arcsin(sine) if kind.errors_of_angles else sine + np.nan
-            angles.append(angle)
-        return ErrorSizes(np.concatenate(lengths), np.concatenate(angles))
+        deviations = self.poses.deviations
+        is_measured = np.isfinite(deviations)
+        values = errors * np.where(is_measured, deviations, 0.0)
+        lengths, sines = np.linalg.norm(values.reshape(-1, 2, 3), axis=2).T
+        angles = np.arcsin(np.minimum(sines, 1.0))
+        has_angles = is_measured[:, 3:].any(axis=1)
+        return ErrorSizes(lengths, np.where(has_angles, angles, np.nan))
+
+    def pose_errors(self, vector: Vector) -> PoseErrors:
+        """Return the errors of all poses at the unknowns."""
+        unknowns = self.nominal.of(vector)
+        return pose_errors(self.robot, unknowns, self.starts, self.poses)
 
     def linearise(self, vector: Vector) -> Linearisation:
         """Return errors at the unknowns and their derivatives by all of them."""
-        unknowns = self.nominal.of(vector)
-        errors = []
-        blocks = []
-        for kind, group in self.groups.items():
-            errors_of_kind = self._linearise_group(kind, group, unknowns)
-            errors.append(errors_of_kind.values.ravel())
-            blocks.append(self._jacobian(group, errors_of_kind))
-        return Linearisation(np.concatenate(errors), np.concatenate(blocks))
+        errors = self.pose_errors(vector)
+        jacobian = np.zeros((*errors.values.shape, len(vector)))
+        jacobian[..., : errors.by_geometry.shape[2]] = errors.by_geometry
+        poses = self.poses
+        for frames, slopes in (
+            (poses.tool, errors.by_tool),
+            (poses.place, errors.by_place),
+        ):
+            columns = self.frame_columns[frames][:, None]
+            columns = np.broadcast_to(columns, slopes.shape)
+            np.put_along_axis(jacobian, columns, slopes, axis=2)
+        return Linearisation(errors.values, jacobian)
 
     def without_errors(self, vector: Vector) -> "CalibrationProblem":
         """Return the problem with the joints moved so that poses have no errors.
@@ -211,45 +161,22 @@ class CalibrationProblem:
             vector: Unknowns; joints do not deflect.
         """
         unknowns = self.nominal.of(vector)
-        unknowns = unknowns._replace(compliances=np.zeros(self.robot.joints))
-        groups = dict(self.groups)
-        for kind in groups:
-            for _ in range(NEWTON_STEPS):
-                # Derivatives by compliances are those by coordinates times torques.
-                group = groups[kind]
-                unit_group = group._replace(torques=np.ones_like(group.torques))
-                errors = self._linearise_group(kind, unit_group, unknowns)
-                inverses = np.linalg.pinv(errors.by_compliances, rcond=1e-3)
-                steps = np.einsum("pje,pe->pj", inverses, errors.values)
-                groups[kind] = group._replace(q=group.q - steps)
-        return dataclasses.replace(self, groups=groups)
+        rigid = unknowns._replace(compliances=np.zeros(self.robot.joints)).vector
+        # Derivatives by compliances are those by coordinates times torques.
+        torques = np.ones_like(self.poses.torques)
+        problem = self.with_poses(torques=torques)
+        for _ in range(NEWTON_STEPS):
+            errors = problem.pose_errors(rigid)
+            slopes = errors.by_geometry[..., 6 * self.robot.bodies :]
+            inverses = np.linalg.pinv(slopes, rcond=1e-3)
+            steps = np.einsum("pje,pe->pj", inverses, errors.values)
+            problem = problem.with_poses(q=problem.poses.q - steps)
+        return problem.with_poses(torques=self.poses.torques)
 
-    def _linearise_group(
-        self, kind: Kind, group: Poses, unknowns: Unknowns
-    ) -> PoseErrors:
-        """Return errors and derivatives of one kind, in whole blocks of poses."""
-        count = len(group.q)
-        padded_count = BLOCK * math.ceil(count / BLOCK)
-        padded_group = Poses(
-            *(np.resize(x, (padded_count, *x.shape[1:])) for x in group)
-        )
-        with double_precision():
-            errors = pose_errors(kind, self.robot, unknowns, self.starts, padded_group)
-            return PoseErrors(*(np.asarray(x)[:count] for x in errors))
-
-    def _jacobian(self, group: Poses, errors: PoseErrors) -> np.ndarray:
-        """Return derivatives by each unknown in its column."""
-        shape = errors.values.shape
-        jacobian = np.zeros((*shape, self.nominal.vector.size))
-        bodies = 6 * self.robot.bodies
-        jacobian[..., :bodies] = errors.by_origins.reshape(*shape, bodies)
-        jacobian[..., bodies : bodies + self.robot.joints] = errors.by_compliances
-        by_frames = ((group.tool, errors.by_tool), (group.place, errors.by_place))
-        for frames, slopes in by_frames:
-            columns = self.frame_columns[frames][:, None, :]
-            columns = np.broadcast_to(columns, slopes.shape)
-            np.put_along_axis(jacobian, columns, slopes, axis=2)
-        return jacobian.reshape(-1, jacobian.shape[-1])
+    def with_poses(self, **fields: Any) -> "CalibrationProblem":
+        """Return the problem with other numbers of its poses."""
+        poses = dataclasses.replace(self.poses, **fields)
+        return dataclasses.replace(self, poses=poses)
 
 
 def build_problem(
@@ -265,7 +192,7 @@ def build_problem(
         bodies: Inertial parameters of its bodies, which need to be rough only; None if
             joints do not deflect.
     """
-    sessions = tuple(dict.fromkeys(x.session for x in observations))
+    sessions = list(dict.fromkeys(x.session for x in observations))
     starts: dict[FrameKey, Frame] = {}
     freedoms: dict[FrameKey, set[int]] = {}
     for observation in observations:
@@ -275,53 +202,40 @@ def build_problem(
             freedoms.setdefault(key, set()).update(numbers)
         # Distances between places tell nothing of where these are.
         if observation.has_poses:
-            estimates = observation.first_estimates(_tips(robot, observation))
+            tips = tip_jacobian(robot, observation.q)
+            estimates = observation.first_estimates(Frame(tips.rotation, tips.position))
             for key, estimate in zip(keys, estimates, strict=True):
                 starts.setdefault(key, estimate)
-    frame_keys = tuple(starts)
-    is_free = [[k in freedoms[key] for k in range(6)] for key in frame_keys]
-    return CalibrationProblem(
-        robot,
-        sessions,
-        frame_keys,
-        stacked([starts[key] for key in frame_keys]),
-        np.array(is_free),
-        _groups(robot, observations, bodies, sessions, frame_keys),
-        bodies,
-    )
-
-
-def _tips(robot: Robot, observation: AbstractObservation) -> Frame:
-    """Return the placements of the nominal end-effector in all poses."""
-    tips = tip_jacobian(robot, observation.q)
-    return Frame(tips.rotation, tips.position)
-
-
-def _groups(robot, observations, bodies, sessions, frame_keys) -> dict[Kind, Poses]:
-    """Return the poses of each kind of observation."""
-    parts: dict[Kind, list[Poses]] = {}
+    frame_keys = list(starts)
+    parts: dict[str, list[np.ndarray]] = {}
     for x in observations:
         q = x.q if x.has_poses else np.zeros((1, robot.joints))
-        poses = len(q)
-
-        def repeated(value, poses=poses):
-            return np.full(poses, value)
-
-        part = Poses(
-            q,
-            gravity_torques(robot, bodies, q),
-            x.measured,
-            np.tile(x.deviations, (poses, 1)),
-            repeated(frame_keys.index(x.tool_key)),
-            repeated(frame_keys.index(x.place_key)),
-            repeated(sessions.index(x.session)),
-            np.arange(1, poses + 1),
-        )
-        parts.setdefault(type(x), []).append(part)
-    return {
-        kind: Poses(*map(np.concatenate, zip(*group, strict=True)))
-        for kind, group in parts.items()
-    }
+        numbers = {
+            "is_distance": x.is_distance,
+            "is_pose": x.has_poses,
+            "tool": frame_keys.index(x.tool_key),
+            "place": frame_keys.index(x.place_key),
+            "session": sessions.index(x.session),
+            "deviations": x.deviations,
+        }
+        columns = {name: np.array([value] * len(q)) for name, value in numbers.items()}
+        columns["q"] = q
+        columns["number"] = np.arange(1, len(q) + 1)
+        columns |= x.measured._asdict()
+        for name, column in columns.items():
+            parts.setdefault(name, []).append(column)
+    fields = {name: np.concatenate(columns) for name, columns in parts.items()}
+    measured = Frame(fields.pop("rotation"), fields.pop("position"))
+    torques = gravity_torques(robot, bodies, fields["q"])
+    return CalibrationProblem(
+        robot,
+        tuple(sessions),
+        tuple(frame_keys),
+        Frame(*map(np.stack, zip(*starts.values(), strict=True))),
+        np.array([[k in freedoms[key] for k in range(6)] for key in frame_keys]),
+        Poses(torques=torques, measured=measured, **fields),
+        bodies,
+    )
 
 
 def gravity_torques(

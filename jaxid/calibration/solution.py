@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxid.arrays import Matrix, Vector
 
-from .adjustment import Adjustment, Weights, adjust, common_step
+from .adjustment import Adjustment, Weights, adjust, common_step, normal_matrices
 from .prior_choice import MIDDLE_PRIOR, GeometryPrior, choose_prior, prior_scales
 from .problem import CalibrationProblem
 from .wrong_poses import find_wrong_poses
@@ -41,9 +41,9 @@ def solve(
     scales = prior_scales(problem, MIDDLE_PRIOR, has_compliance)
     start = problem.nominal.vector
     is_wrong, vector = find_wrong_poses(problem, start, scales, session_weights)
-    is_unseen = session_weights[problem.pose_sessions] == 0.0
+    is_unseen = session_weights[problem.poses.session] == 0.0
     # Known distances between places of other sessions are not used, either.
-    is_left_out = is_wrong | (is_unseen & ~problem.is_pose)
+    is_left_out = is_wrong | (is_unseen & ~problem.poses.is_pose)
     weights = Weights(session_weights, np.where(is_left_out, 0.0, 1.0))
     prior = choose_prior(problem, vector, weights, has_compliance)
     scales = prior_scales(problem, prior, has_compliance)
@@ -85,8 +85,7 @@ def covariances(problem: CalibrationProblem, solution: Solution) -> Covariances:
     deviations = steps - steps.mean(axis=0)
     scatter = (count - 1) / count * deviations.T @ deviations
 
-    matrices = np.stack([x.matrix for x in equations])
-    matrix = np.einsum("s,sij->ij", session_weights, matrices)
+    matrix = np.tensordot(session_weights, normal_matrices(equations), 1)
     system = np.eye(len(scales)) + scales[:, None] * matrix * scales
     inverse = scales[:, None] * np.linalg.inv(system)
     return Covariances(scatter, inverse @ inverse.T, inverse * scales)

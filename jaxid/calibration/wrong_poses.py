@@ -30,10 +30,15 @@ class ErrorLimits(NamedTuple):
 LIMITS = ErrorLimits()
 
 
-def pose_sizes(problem: CalibrationProblem, errors: Vector) -> Vector:
-    """Return the size of each pose's errors, of which the median is one for noise."""
-    squares = np.bincount(problem.rows.pose, errors**2)
-    counts = np.bincount(problem.rows.pose)
+def pose_sizes(errors: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+    """Return the size of each pose's errors, of which the median is one for noise.
+
+    Args:
+        errors: Errors in units of their deviations [..., poses, 6].
+        deviations: Deviations, infinite for numbers that are not measured.
+    """
+    counts = np.isfinite(deviations).sum(axis=1)
+    squares = np.sum(errors**2, axis=-1)
     return np.sqrt(squares / scipy.special.chdtri(counts, 0.5))
 
 
@@ -47,8 +52,8 @@ def find_wrong_poses(
 
     Sessions without weight are not looked at: none of their poses is wrong.
     """
-    is_used = session_weights[problem.pose_sessions] > 0.0
-    is_used &= problem.is_pose
+    is_used = session_weights[problem.poses.session] > 0.0
+    is_used &= problem.poses.is_pose
     weights = np.ones(len(is_used))
     relative_sizes = np.zeros(len(is_used))
     vector = start
@@ -59,7 +64,7 @@ def find_wrong_poses(
         vector = end.vector
         if number < EQUAL_STEPS:
             continue
-        sizes = pose_sizes(problem, end.linearisation.errors)
+        sizes = pose_sizes(end.linearisation.errors, problem.poses.deviations)
         typical_size = max(np.median(sizes[is_used]), LIMITS.min_typical_size)
         relative_sizes = np.where(is_used, sizes / typical_size, 0.0)
         weights = 1.0 / (1.0 + (relative_sizes / LIMITS.half_weight) ** 2) ** 2

@@ -148,15 +148,14 @@ def pose_error_figure(fit: GeometryFit) -> Figure:
 def workspace_figure(fit: GeometryFit) -> Figure:
     """Return where in the workspace errors are left, from above and from the side."""
     problem = fit.problem
-    groups = [group for kind, group in problem.groups.items() if kind.has_poses]
-    q = np.concatenate([group.q for group in groups])
-    points = tip_jacobian(problem.robot, q).position
+    is_pose = problem.poses.is_pose
+    points = tip_jacobian(problem.robot, problem.poses.q[is_pose]).position
     panels = []
     for title, errors in (
         ("nominal", fit.shown_errors.nominal.lengths),
         ("calibrated", fit.shown_errors.calibrated.lengths),
     ):
-        lengths = errors[problem.is_pose]
+        lengths = errors[is_pose]
         for view, axes in (("from above", (0, 1)), ("from the side", (0, 2))):
             labels = [f"{'xyz'[axis]} [m]" for axis in axes]
             curves = _classes(points[:, axes], lengths)

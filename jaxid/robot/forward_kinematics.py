@@ -59,6 +59,10 @@ class TipJacobian(NamedTuple):
             the ground [poses bodies 3].
         turn: Angular velocities by the same rates [poses bodies 3].
         ratios: These rates by those of the coordinates [bodies joints].
+        frames: Attitudes on the ground of the bodies at rest in their joints, whose
+            axes they turn about or slide along; zero beside the end-effector's chain
+            [poses bodies 3 3].
+        origins: Origins of these frames [m].
     """
 
     rotation: np.ndarray
@@ -66,6 +70,8 @@ class TipJacobian(NamedTuple):
     velocity: np.ndarray
     turn: np.ndarray
     ratios: np.ndarray
+    frames: np.ndarray
+    origins: np.ndarray
 
     @property
     def slopes(self) -> np.ndarray:
@@ -93,10 +99,12 @@ def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
     R = np.broadcast_to(np.eye(3), (poses, 3, 3))
     r = np.zeros((poses, 3))
     origin, turn, slide = np.zeros((3, *q.shape, 3))
+    frames = np.zeros((*q.shape, 3, 3))
     for i in robot.ancestors[robot.tip_body]:
         r = r + R @ offset[i]
         R = R @ rotation[i]
         direction = R @ axis[i]
+        frames[:, i] = R
         origin[:, i] = r
         if robot.turns[i]:
             turn[:, i] = direction
@@ -112,7 +120,13 @@ def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
     order = list(robot.order)
     ratios = linear_ratios(robot.followers, robot.joints)
     return TipJacobian(
-        attitude, position, velocity[:, order], turn[:, order], ratios[order]
+        attitude,
+        position,
+        velocity[:, order],
+        turn[:, order],
+        ratios[order],
+        frames,
+        origin,
     )
 
 

@@ -116,7 +116,6 @@ def test_undetermined_corrections_are_the_null_space(fit, robot, arm):
     )
     # The distance of the sockets adds the size of the arm.
     assert len(fit.combinations.leaders) - compliances == rank + 1
-    assert fit.combinations.rank == len(fit.combinations.leaders)
     assert fit.combinations.gap > 1e5
 
 
@@ -127,7 +126,7 @@ def test_dependent_corrections_do_nothing_that_others_do_not(fit):
     tool = problem.common_columns[-6:-3]
     nominal[tool] = fit.values[-6:-3]
     exact = problem.without_errors(nominal)
-    jacobian = exact.linearise(nominal).jacobian
+    jacobian = exact.linearise(nominal).jacobian.reshape(-1, len(nominal))
     largest_effect = np.linalg.norm(jacobian, axis=0).max()
     for follower, factors in zip(
         fit.combinations.followers, fit.combinations.factors.T, strict=True
@@ -180,17 +179,27 @@ def test_the_optimum_is_that_of_scipy(fit):
     problem = fit.problem
     scales = fit.solution.scales
     is_free = scales > 0
-    weights = np.sqrt(fit.solution.weights.poses[problem.rows.pose])
+    # Places have no prior.
+    has_prior = np.isin(np.flatnonzero(is_free), problem.common_columns)
+    weights = np.sqrt(fit.solution.weights.poses)[:, None]
 
-    def residuals(y):
+    def at(y):
         vector = np.zeros(len(scales))
         vector[is_free] = y * scales[is_free]
-        errors = problem.linearise(vector).errors
-        return np.concatenate([weights * errors, y])
+        return problem.linearise(vector)
+
+    def residuals(y):
+        errors = weights * at(y).errors
+        return np.concatenate([errors.ravel(), y * has_prior])
+
+    def jacobian(y):
+        slopes = weights[..., None] * at(y).jacobian * scales
+        columns = slopes[..., is_free].reshape(-1, len(y))
+        return np.concatenate([columns, np.diag(1.0 * has_prior)])
 
     start = fit.solution.adjustment.vector[is_free] / scales[is_free]
     optimum = scipy.optimize.least_squares(
-        residuals, start + 0.01, x_scale="jac", xtol=1e-12, ftol=1e-12, gtol=1e-8
+        residuals, start + 0.01, jacobian, xtol=1e-12, ftol=1e-14, gtol=1e-8
     )
     assert np.abs(optimum.x - start).max() < 1e-3
     assert optimum.cost == pytest.approx(0.5 * np.sum(residuals(start) ** 2), rel=1e-7)
@@ -236,13 +245,11 @@ def test_held_out_errors_are_larger_than_those_of_the_fit(fit):
 
 def test_proposed_sessions_can_be_recorded_and_pay_less_and_less(fit, robot):
     """Poses are within the limits, and leave the tool at one point."""
-    proposals = c.propose_sessions(
-        fit, c.PointContact, sessions=3, poses=12, candidates=8
-    )
+    proposals = c.propose_sessions(fit, sessions=3, poses=12, candidates=12)
     tool = fit.frames["", "tool"].position
     calibrated = TrueArm(fit.robot)
     for session in proposals:
-        assert len(session.q) >= 6
+        assert len(session.q) == 12
         assert (session.q <= robot.limits.position_max).all()
         assert (session.q >= robot.limits.position_min).all()
         points = calibrated.placements(session.q, tool)[1]

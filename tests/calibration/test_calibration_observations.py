@@ -120,8 +120,10 @@ def test_derivatives_are_those_of_differences(observations, robot):
         upper = problem.linearise(vector + step).errors
         lower = problem.linearise(vector - step).errors
         difference = (upper - lower) / (2 * step[column])
-        size = np.abs(jacobian[:, column]).max()
-        assert jacobian[:, column] == pytest.approx(difference, abs=1e-5 * size + 1e-6)
+        size = np.abs(jacobian[..., column]).max()
+        assert jacobian[..., column] == pytest.approx(
+            difference, abs=1e-5 * size + 1e-6
+        )
 
 
 def test_derivatives_of_a_tree_with_a_rail_and_a_follower():
@@ -152,10 +154,12 @@ def test_derivatives_of_a_tree_with_a_rail_and_a_follower():
         upper = problem.linearise(vector + step).errors
         lower = problem.linearise(vector - step).errors
         difference = (upper - lower) / 2e-5
-        size = np.abs(jacobian[:, column]).max()
-        assert jacobian[:, column] == pytest.approx(difference, abs=1e-5 * size + 1e-5)
+        size = np.abs(jacobian[..., column]).max()
+        assert jacobian[..., column] == pytest.approx(
+            difference, abs=1e-5 * size + 1e-5
+        )
     # The body beside the chain does not move the end-effector.
-    assert not jacobian[:, 18:24].any()
+    assert not jacobian[..., 18:24].any()
 
 
 @pytest.mark.parametrize(
