@@ -16,7 +16,16 @@ from typing import NamedTuple
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, BaseVector, Float, Indices, Joints, Matrices, Matrix
+from jaxid.arrays import (
+    AnyArray,
+    BaseVector,
+    Float,
+    Indices,
+    Joints,
+    Matrices,
+    Matrix,
+    on_cores,
+)
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.observations import Observations
@@ -97,19 +106,26 @@ def row_chunks(
     Only some ranges of rows are made, or all.
     """
     mask = np.asarray(observations.mask)
-    for chunk in observations.chunks(samples, ranges):
-        motion, forces = observations.read(slice(*chunk.samples))
-        forces = without_tool(base, motion, forces)
+
+    def recorded() -> Iterator[tuple]:
+        for chunk in observations.chunks(samples, ranges):
+            yield chunk, *observations.read(slice(*chunk.samples))
+
+    def rows_of(part: tuple) -> RowChunk:
+        chunk, motion, forces = part
         rows = slice(*chunk.rows)
-        yield RowChunk(
+        return RowChunk(
             recording=0,
             block=0,
             rows=rows,
             indices=base.acting_columns,
             columns=[chunk.reduce(theta) for theta in base.regressor_rows(motion)],
-            forces=chunk.reduce(forces),
+            forces=chunk.reduce(without_tool(base, motion, forces)),
             mask=mask[rows],
         )
+
+    # One core makes the rows of a chunk; the next ones are read meanwhile.
+    yield from on_cores(rows_of, recorded())
 
 
 def without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> Matrix:

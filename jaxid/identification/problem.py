@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import BaseVector, Joints, Matrices, Matrix
+from jaxid.arrays import BaseVector, Joints, Matrices, Matrix, on_cores
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
@@ -14,7 +14,6 @@ from jaxid.measurement.observations import Observations, ObservedLogs, Progress
 from jaxid.robot.robot import Robot
 
 from .factors import Blocks, Factors, Ranges, RowChunk, empty_factors, row_chunks
-from .long_logs import stream_blocks, suits
 
 
 class Span(NamedTuple):
@@ -45,12 +44,10 @@ class RegressionProblem:
         names: Names of the recordings; by default their own.
     """
 
-    samples_per_chunk = 65536
+    samples_per_chunk = 32768
     """Samples whose columns are evaluated at once."""
     cached_numbers = 2**26
     """Numbers (half a gigabyte) up to which columns are kept for the next pass."""
-    compiled_samples = 100_000
-    """Samples from which it pays to compile the pass over a recording."""
 
     def __init__(
         self,
@@ -86,14 +83,8 @@ class RegressionProblem:
             return self._initial_blocks
         self.require_rows()
         parts = []
-        for number, recording in enumerate(self.recordings):
-            # Compiling the pass pays for long recordings with short filters.
-            if recording.samples >= self.compiled_samples and suits(recording):
-                report = functools.partial(self._report, number)
-                edges = self._edges[number]
-                parts += stream_blocks(self.base, recording, edges, report)
-            else:
-                parts += self._reduce(number, RowChunk.equations)
+        for number in range(len(self.recordings)):
+            parts += self._reduce(number, RowChunk.equations)
         return Blocks(tuple(parts))
 
     @functools.cached_property
@@ -124,9 +115,12 @@ class RegressionProblem:
         empty_part = empty_factors(self.base.acting_columns, self.base.size)
         parts = [empty_part] * (len(self._edges[number]) - 1)
         first_block = self._first_block(number)
-        for chunk in self.recording_chunks(number):
-            block = chunk.block - first_block
-            parts[block] = parts[block].append(equations(chunk))
+
+        def reduce(chunk: RowChunk) -> tuple[int, Factors]:
+            return chunk.block - first_block, empty_part.append(equations(chunk))
+
+        for block, factors in on_cores(reduce, self.recording_chunks(number)):
+            parts[block] += factors
         return parts
 
     def _first_block(self, number: int) -> int:

@@ -165,7 +165,7 @@ def test_parts_of_a_log_streams_and_the_whole_agree(filtered):
     np.testing.assert_allclose(source.read_all()[0].state, whole, atol=1e-12)
 
     class Streamed(RegressionProblem):
-        compiled_samples = 1
+        samples_per_chunk = 500
 
     plain, streamed = (
         kind(base, log).factors for kind in (RegressionProblem, Streamed)

@@ -75,10 +75,19 @@ def test_passes_visit_every_row_that_the_factors_stand_for(
         np.testing.assert_allclose(np.concatenate(forces), matrix[1], atol=1e-12)
 
 
-def test_chunks_change_only_rounding(base):
+@pytest.mark.parametrize(
+    "fields",
+    [
+        {},
+        {"segments": ((0, 2500), (2500, 3800), (3800, 6000))},
+        {"decimation": jid.Decimation((5, 2))},
+    ],
+)
+def test_chunks_change_only_rounding(base, fields):
     smooth = jid.ZeroPhaseButterworth(20.0, margin=0.2)
     p = standard_parameters(base.model)
     o = observations(base.model, p, samples=6000, noise=0.3, filter=smooth, every=10)
+    o = o.replace(**fields)
     parts = []
     for samples in (6000, 1000):
         problem = jid.RegressionProblem(base, [o])
