@@ -13,6 +13,10 @@ if TYPE_CHECKING:
 
 MAX_EXAMPLES = 5
 """Number of poses that a sentence names."""
+MIN_POSES = 10
+"""Number of different poses of a place below which it tells little."""
+POSE_DECIMALS = 2
+"""Decimals to which equal poses agree [rad or m]."""
 MIN_DISTANCES = 3
 """Number of known distances below which they are not judged."""
 
@@ -34,6 +38,7 @@ def calibration_findings(fit: "GeometryFit") -> list[Remark]:
     findings = [
         *(Remark(note, Status.DOUBTFUL) for note in fit.notes),
         *_on_search(fit),
+        *_on_few_poses(fit),
         *_on_wrong_poses(fit),
         *_on_corrections(fit),
         *_on_held_out_sessions(fit),
@@ -78,6 +83,19 @@ def _on_search(fit: "GeometryFit") -> Iterator[Remark]:
             "and the robot's file",
             Status.BAD,
         )
+
+
+def _on_few_poses(fit: "GeometryFit") -> Iterator[Remark]:
+    """Yield a finding on places with few different poses."""
+    for (session, place), rows in fit.problem.poses_of_places.items():
+        q = fit.problem.poses.q[rows]
+        count = len(np.unique(np.round(q, POSE_DECIMALS), axis=0))
+        if count < MIN_POSES:
+            yield Remark(
+                f"Session `{session}` has {count} different poses of `{place}`: record "
+                "20 to 30",
+                Status.DOUBTFUL,
+            )
 
 
 def _on_wrong_poses(fit: "GeometryFit") -> Iterator[Remark]:

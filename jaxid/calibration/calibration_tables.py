@@ -34,12 +34,12 @@ def in_thousandths(value: float) -> str:
 
 
 def session_table(fit: "GeometryFit") -> Table:
-    """Return mean errors of the poses of each session, before and after."""
-    problem = fit.problem
-    sessions = problem.sessions
-    poses = problem.poses_of_sessions
+    """Return mean errors of the poses of each session and place, before and after."""
+    places = fit.problem.poses_of_places
+    poses = list(places.values())
     columns = [
-        Column("session", sessions),
+        Column("session", [session for session, _ in places]),
+        Column("place", [place for _, place in places]),
         Column("poses", [len(x) for x in poses]),
         Column("left out", [int(fit.solution.is_wrong[x].sum()) for x in poses]),
     ]

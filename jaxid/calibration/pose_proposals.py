@@ -7,8 +7,9 @@ import numpy as np
 import scipy
 
 from jaxid.arrays import Matrix, Vector, double_precision
+from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
-from jaxid.robot.collision import CollisionModel
+from jaxid.excitation.constraints import Clearance
 from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.limits_and_drives import complete_limits
 
@@ -39,8 +40,7 @@ def propose_sessions(
     sessions: int = 3,
     poses: int = 20,
     candidates: int = 40,
-    collision: CollisionModel | None = None,
-    distance: float = 0.03,
+    clearance: Clearance | None = None,
     seed: int = 0,
 ) -> list[ProposedSession]:
     """Return sessions that determine best what the present ones leave open.
@@ -55,8 +55,7 @@ def propose_sessions(
         sessions: Number of sessions to propose.
         poses: Number of poses in each.
         candidates: Number of random places.
-        collision: Shapes that must keep a distance; None without.
-        distance: That distance [m].
+        clearance: Distance that shapes must keep; None without.
         seed: Seed of the random places.
 
     Raises:
@@ -65,13 +64,13 @@ def propose_sessions(
     rng = np.random.default_rng(seed)
     drafts = []
     for _ in range(candidates):
-        problem = _reachable_session(fit, poses, rng, collision, distance)
+        problem = _reachable_session(fit, poses, rng, clearance)
         if len(problem.poses.q) == poses:
             drafts.append(problem)
     if not drafts:
         raise InputError(
             f"no place was found that the tool can reach in {poses} postures: ask for "
-            "fewer `poses`, or make room for the robot (`collision`)."
+            "fewer `poses`, or make room for the robot (`clearance`)."
         )
     return _best_sessions(fit, drafts, sessions)
 
@@ -109,8 +108,7 @@ def _reachable_session(
     fit: GeometryFit,
     poses: int,
     rng: np.random.Generator,
-    collision: CollisionModel | None,
-    distance: float,
+    clearance: Clearance | None,
 ) -> CalibrationProblem:
     """Return a session of poses around a random posture that the robot can take."""
     robot = fit.robot
@@ -132,10 +130,11 @@ def _reachable_session(
         is_possible = np.ones(len(q), bool)
     q = problem.poses.q
     is_possible &= np.all(np.abs(q - middle) <= half_range, axis=1)
-    if collision is not None:
+    if clearance is not None:
+        rest = np.zeros_like(q)
         with double_precision():
-            gaps = np.asarray(collision.clearance(robot, q))
-        is_possible &= gaps.reshape(len(q), -1).min(axis=1) >= distance
+            excess = np.asarray(clearance(robot, Motion(q, rest, rest)))
+        is_possible &= excess.max(axis=1) <= 0.0
     best = q[is_possible][:poses]
     return _session_at(fit, posture, best)
 

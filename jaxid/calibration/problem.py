@@ -87,6 +87,17 @@ class CalibrationProblem:
             for session in range(len(self.sessions))
         ]
 
+    @property
+    def poses_of_places(self) -> dict[tuple[str, str], np.ndarray]:
+        """Indices of the poses of each place, by the names of session and place."""
+        poses = self.poses
+        rows: dict[tuple[str, str], list[int]] = {}
+        for pose in np.flatnonzero(poses.is_pose):
+            _, place = self.frame_keys[poses.place[pose]]
+            key = (self.sessions[poses.session[pose]], place)
+            rows.setdefault(key, []).append(int(pose))
+        return {key: np.array(numbers) for key, numbers in rows.items()}
+
     @cached_property
     def session_columns(self) -> list[np.ndarray]:
         """Columns of the frames that belong to each session alone."""
@@ -109,13 +120,11 @@ class CalibrationProblem:
     @property
     def pose_names(self) -> list[str]:
         """Session, place and number of each pose."""
-        poses = self.poses
-        return [
-            f"{self.sessions[session]}, {self.frame_keys[place][1]}, pose {number}"
-            for session, place, number in zip(
-                poses.session, poses.place, poses.number, strict=True
-            )
-        ]
+        names = ["" for _ in self.poses.number]
+        for (session, place), rows in self.poses_of_places.items():
+            for row in rows:
+                names[row] = f"{session}, {place}, pose {self.poses.number[row]}"
+        return names
 
     def error_sizes(self, errors: Float[np.ndarray, "poses 6"]) -> ErrorSizes:
         """Return the lengths and angles of the errors of each pose.

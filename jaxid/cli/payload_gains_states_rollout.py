@@ -167,6 +167,10 @@ def calibrate(
             metavar="SESSIONS",
         ),
     ],
+    log: Annotated[
+        list[Path] | None,
+        typer.Option(metavar="LOG", help="Torques that both geometries shall explain."),
+    ] = None,
     output: options.OutputFolder = Path("calibrated"),
     force: options.Force = False,
     detail: options.Detail = None,
@@ -175,14 +179,24 @@ def calibrate(
 
     From poses in which something was touched or measured, in several sessions. The
     table `[calibration]` of the experiment file says what. Writes the robot's file with
-    calibrated origins, and a page with the errors of every pose before and after.
+    calibrated origins, a page with the errors of every pose before and after, and a
+    table of poses to record next.
     """
+    paths = log or []
     console = options.start(
-        *sessions, experiment=experiment, output=output, force=force
+        *sessions, *paths, experiment=experiment, output=output, force=force
     )
     content = jid.experiment.load_experiment(experiment)
+    logs = None
+    if paths:
+        logs = jid.workflow.TorqueLogs(paths, content.require_columns(paths))
     with terminal.progress_bar(counts_all=True) as progress:
         report = jid.workflow.calibrate_from_files(
-            content.setup, sessions, content.calibration, progress
+            content.setup,
+            sessions,
+            content.calibration,
+            progress,
+            content.surroundings.clearance,
+            logs,
         )
     show_runs(console, detail, report, output, content.text)

@@ -7,15 +7,19 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.arrays import Vector
-from jaxid.calibration import GeometryFit
+from jaxid.calibration import GeometryFit, ProposedSession, propose_sessions
+from jaxid.errors import InputError
+from jaxid.excitation.constraints import Clearance
 from jaxid.export.calibrated_origins import export_origins
 from jaxid.io import FilePath
-from jaxid.result_table import Remark, significant
+from jaxid.result_table import Remark, Table, percent, significant
 from jaxid.robot.description_files import is_mjcf
 from jaxid.robot.forward_kinematics import tip_jacobian
+from jaxid.robot.limits_and_drives import complete_limits
 
 from .figure import Figure
 from .figure_elements import BLUE, GREY, VERMILION, Curve, Panel
+from .result_files import write_csv
 from .result_records import Record, estimate_rows
 from .several_runs_report import Answer, RunsReport
 
@@ -23,6 +27,10 @@ CLASSES = {"below the median": GREY, "above it": BLUE, "largest tenth": VERMILIO
 """Classes of errors in the workspace, and their colours."""
 QUANTILES = (0.5, 0.9)
 """Shares of the poses below the ends of the classes."""
+MIN_NARROWING = 0.05
+"""Share of the intervals below which another session does not pay."""
+MIN_SHARE_OF_RANGE = 0.3
+"""Share of its range that each joint should use in all poses together."""
 HOW_TO_READ = (
     "A combination is named after one correction; the table before shows which others "
     "the poses cannot tell from it. Intervals take the session as the unit."
@@ -31,7 +39,13 @@ HOW_TO_READ = (
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class CalibrationReport(RunsReport):
-    """Result of a kinematic calibration; the robot's file is written, too."""
+    """Result of a kinematic calibration; the robot's file is written, too.
+
+    Attributes:
+        poses_to_record: Rows of the table of poses that are proposed.
+    """
+
+    poses_to_record: Sequence[Record] = ()
 
     @property
     def verdict(self) -> Remark:
@@ -40,27 +54,37 @@ class CalibrationReport(RunsReport):
 
     def overview(self) -> list:
         """Return verdict, findings and errors of the sessions."""
-        return self.result.overview()
+        _, sessions = self.result.overview()
+        return [Table("", remarks=self.findings), sessions]
 
     def save(self, folder: FilePath) -> list[Path]:
-        """Write page, numbers, and the robot with calibrated origins."""
+        """Write page, numbers, poses to record, and the robot's file."""
         files = super().save(folder)
+        if self.poses_to_record:
+            files.append(Path(folder) / "poses_to_record.csv")
+            write_csv(files[-1], list(self.poses_to_record))
         source = Path(self.result.problem.robot.source)
-        if not source.is_file():
-            return files
-        name = "robot.xml" if is_mjcf(source) else "robot.urdf"
-        path = export_origins(self.result, Path(folder) / name)
-        return [*files, path]
+        if source.is_file():
+            name = "robot.xml" if is_mjcf(source) else "robot.urdf"
+            files.append(export_origins(self.result, Path(folder) / name))
+        return files
 
 
 def calibration_report(
-    fit: GeometryFit, sources: Mapping[str, Sequence[Path]]
+    fit: GeometryFit,
+    sources: Mapping[str, Sequence[Path]],
+    clearance: Clearance | None,
+    units: Vector,
+    findings: Sequence[Remark] = (),
 ) -> CalibrationReport:
     """Return the report of a calibration.
 
     Args:
         fit: Calibrated geometry.
         sources: Files of each session.
+        clearance: Distance that shapes keep in poses that are proposed.
+        units: Units of the joint coordinates in files [rad or m].
+        findings: Further findings.
     """
     run = fit.run
     rows = estimate_rows(run.names, run.units, run.parameters, fit.uncertainty)
@@ -68,6 +92,8 @@ def calibration_report(
         row["kind"] = kind
         row["dof"] = run.dof
     sessions, corrections, _, undetermined = fit.tables()
+    proposals = _proposals(fit, clearance)
+    advice = [Remark(x) for x in _advice(fit, proposals, clearance)]
     return CalibrationReport(
         "calibration",
         fit,
@@ -75,9 +101,67 @@ def calibration_report(
         rows,
         _content(fit),
         sources,
-        findings=fit.findings,
+        findings=[*fit.findings, *findings, *advice],
         details=[sessions, corrections, undetermined],
+        poses_to_record=_rows(fit, proposals, units),
     )
+
+
+def _proposals(fit: GeometryFit, clearance: Clearance | None) -> list[ProposedSession]:
+    """Return sessions to record next; none if the tool reaches no place."""
+    try:
+        return propose_sessions(fit, clearance=clearance)
+    except InputError:
+        return []
+
+
+def _advice(
+    fit: GeometryFit, proposals: list[ProposedSession], clearance: Clearance | None
+) -> list[str]:
+    """Return which poses are missing, and whether more of them pay."""
+    robot = fit.problem.robot
+    q = fit.problem.poses.q[fit.problem.poses.is_pose]
+    limits = complete_limits(robot)
+    shares = np.ptp(q, axis=0) / (limits.position_max - limits.position_min)
+    narrow_joints = [
+        f"`{robot.joint_names[joint]}` ({percent(shares[joint])} %)"
+        for joint in np.flatnonzero(shares < MIN_SHARE_OF_RANGE)
+    ]
+    sentences = []
+    if narrow_joints:
+        sentences.append(
+            "Postures are missing: of their ranges, the poses use little of "
+            + ", ".join(narrow_joints)
+        )
+    if not proposals:
+        return [*sentences, "No place was found at which more poses could be recorded"]
+    shapes = "not checked for collisions" if clearance is None else "without collision"
+    narrowings = [f"{percent(max(x.narrowing, 0.0))} %" for x in proposals]
+    poses = len(proposals[0].q)
+    sentence = (
+        f"Of more sessions with {poses} poses each, the next ones would narrow the "
+        f"intervals by {', '.join(narrowings)}: `poses_to_record.csv` "
+        f"(within limits, {shapes})"
+    )
+    if proposals[0].narrowing < MIN_NARROWING:
+        sentence = (
+            "More sessions hardly pay: the best of those that were tried would narrow "
+            f"the intervals by {narrowings[0]}"
+        )
+    return [*sentences, sentence]
+
+
+def _rows(
+    fit: GeometryFit, proposals: list[ProposedSession], units: Vector
+) -> list[Record]:
+    """Return a row for each pose to record, with angles in the files' unit."""
+    names = fit.problem.robot.joint_names
+    rows = []
+    for session, proposal in enumerate(proposals, 1):
+        for q in proposal.q / units:
+            coordinates = dict(zip(names, q.tolist(), strict=True))
+            rows.append({"session": session, **coordinates})
+    return rows
 
 
 def _content(fit: GeometryFit) -> Record:
@@ -125,37 +209,34 @@ def _answer(fit: GeometryFit) -> Answer:
 
 
 def pose_error_figure(fit: GeometryFit) -> Figure:
-    """Return the error of every pose before and after, one panel for each session."""
+    """Return the error of every pose before and after, a panel for each session."""
     errors = fit.shown_errors
     panels = []
     for session, poses in zip(
         fit.problem.sessions, fit.problem.poses_of_sessions, strict=True
     ):
         numbers = np.arange(1, len(poses) + 1)
-        before = 1e3 * errors.nominal.lengths[poses]
-        after = 1e3 * errors.calibrated.lengths[poses]
         curves = [
-            Curve(numbers, before, "nominal", GREY, kind="points"),
-            Curve(numbers, after, "calibrated", BLUE, kind="points"),
+            Curve(numbers, 1e3 * x.lengths[poses], name, colour, kind="points")
+            for x, name, colour in (
+                (errors.nominal, "nominal", GREY),
+                (errors.calibrated, "calibrated", BLUE),
+            )
         ]
-        mean = f"{significant(before.mean())} → {significant(after.mean())} mm"
-        panels.append(
-            Panel(curves, session, mean, x="pose", y="error", unit="mm", log="y")
-        )
+        panels.append(Panel(curves, session, x="pose", y="error", unit="mm", log="y"))
     return Figure(f"error of every pose, {fit.manner}", panels, columns=2)
 
 
 def workspace_figure(fit: GeometryFit) -> Figure:
     """Return where in the workspace errors are left, from above and from the side."""
-    problem = fit.problem
-    is_pose = problem.poses.is_pose
-    points = tip_jacobian(problem.robot, problem.poses.q[is_pose]).position
+    poses = fit.problem.poses
+    points = tip_jacobian(fit.problem.robot, poses.q[poses.is_pose]).position
     panels = []
     for title, errors in (
-        ("nominal", fit.shown_errors.nominal.lengths),
-        ("calibrated", fit.shown_errors.calibrated.lengths),
+        ("nominal", fit.shown_errors.nominal),
+        ("calibrated", fit.shown_errors.calibrated),
     ):
-        lengths = errors[is_pose]
+        lengths = errors.lengths[poses.is_pose]
         for view, axes in (("from above", (0, 1)), ("from the side", (0, 2))):
             labels = [f"{'xyz'[axis]} [m]" for axis in axes]
             curves = _classes(points[:, axes], lengths)

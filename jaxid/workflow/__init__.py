@@ -6,6 +6,7 @@ from .excitation_settings import Excitation as Excitation, Leads as Leads
 from .force_sensor_payload import ForceSensor as ForceSensor
 from .geometry_calibration import (
     CalibrationSettings as CalibrationSettings,
+    TorqueLogs as TorqueLogs,
     calibrate_from_files as calibrate_from_files,
 )
 from .log_identification import (

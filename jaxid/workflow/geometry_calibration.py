@@ -8,19 +8,38 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import scipy
 
+from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
+from jaxid.excitation.constraints import Clearance
+from jaxid.identification.problem import RegressionProblem
+from jaxid.measurement.columns import Columns
 from jaxid.measurement.log_files import READERS, open_log_file
+from jaxid.result_table import Remark, Status, percent
+from jaxid.robot.robot import Robot
+from jaxid.validation.torque_errors import validate
 
+from .log_identification import split_logs
+from .log_loading import load_logs
 from .setup import Paths, Progress, Setup, ignore_progress
 
 if TYPE_CHECKING:
     from jaxid.calibration import AbstractObservation
     from jaxid.report.calibration_report import CalibrationReport
 
-Columns = str | int | list[str | int]
+ColumnNames = str | int | list[str | int]
 """One column, several, or a pattern with `{}` for numbers."""
 ATTITUDE_SIZES = {3: "from_rotvec", 4: "from_quat"}
 """How many columns hold an attitude, and how SciPy reads it."""
+MEASUREMENTS = {
+    "measured_position": ("position",),
+    "measured_pose": ("position", "attitude"),
+    "eye_in_hand": ("position", "attitude"),
+}
+"""Keys of the columns that hold measurements, by the kind of observation."""
+HELD_OUT_SHARE = 0.4
+"""Last part of each log of torques that is kept for their errors."""
+MIN_CHANGE = 0.02
+"""Relative change of the torques' errors that is worth a word."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -31,7 +50,9 @@ class CalibrationSettings:
         observation: What was measured. `point_contact`: a point of the tool stayed at
             one place, like a ball in a socket; `plane_contact`: it touched a plane;
             `known_distance`: it had a known distance from a fixed point;
-            `measured_position` and `measured_pose`: an instrument measured it.
+            `measured_position` and `measured_pose`: an instrument measured the tool, or
+            the pose of a camera on the robot is known in the frame of a board;
+            `eye_in_hand`: such a camera measured the pose of the board.
         joints: Columns of the joint coordinates, like `"q{}"`; by default the first
             ones.
         position: Columns of a measured position, like `["x", "y", "z"]`.
@@ -39,16 +60,10 @@ class CalibrationSettings:
             vector [rad], or a quaternion (x, y, z, w).
         angle_unit: Unit of the joint coordinates.
         length_unit: Unit of measured positions and distances.
-        eye_in_hand: Whether a measured pose is that of a board in a camera on the
-            robot. Otherwise it is that of the tool in the frame of the instrument, or
-            that of a camera on the robot in the frame of a board.
         distance: Distance from the fixed point, in the length unit; for point contacts
             that of the two places of each session, if it is known.
-        place_stays: Whether all sessions have the same place (instrument, board).
         parts: Number of random parts into which all poses are divided, as sessions, if
             everything was set up only once; 1 for sessions of their own.
-        deviation: Standard deviation of measured lengths [m].
-        angle_deviation: Standard deviation of measured attitudes [rad].
         compliance: Whether joints deflect under gravity.
         masses: Rough masses of the bodies [kg], like `[5.0, 0.6, 3.2]`; by default the
             bodies of the robot's file.
@@ -60,18 +75,15 @@ class CalibrationSettings:
         "known_distance",
         "measured_position",
         "measured_pose",
+        "eye_in_hand",
     ] = "point_contact"
-    joints: Columns | None = None
-    position: Columns | None = None
-    attitude: Columns | None = None
+    joints: ColumnNames | None = None
+    position: ColumnNames | None = None
+    attitude: ColumnNames | None = None
     angle_unit: Literal["rad", "deg"] = "rad"
     length_unit: Literal["m", "mm"] = "m"
-    eye_in_hand: bool = False
     distance: float | None = None
-    place_stays: bool = False
     parts: int = 1
-    deviation: float | None = None
-    angle_deviation: float | None = None
     compliance: bool = True
     masses: list[float] | None = None
 
@@ -79,6 +91,18 @@ class CalibrationSettings:
     def metres(self) -> float:
         """Length unit [m]."""
         return 1e-3 if self.length_unit == "mm" else 1.0
+
+    def radians(self, robot: Robot) -> np.ndarray:
+        """Return the unit of each joint's coordinate [rad or m]."""
+        angle = np.deg2rad(1.0) if self.angle_unit == "deg" else 1.0
+        return np.where(robot.revolute, angle, 1.0)
+
+
+class TorqueLogs(NamedTuple):
+    """Logs of torques, which better geometry may explain better."""
+
+    paths: Paths
+    columns: Columns
 
 
 class SessionFile(NamedTuple):
@@ -94,6 +118,8 @@ def calibrate_from_files(
     paths: Paths,
     settings: CalibrationSettings,
     progress: Progress = ignore_progress,
+    clearance: Clearance | None = None,
+    logs: TorqueLogs | None = None,
 ) -> "CalibrationReport":
     """Calibrate the geometry of a robot from the files of several sessions.
 
@@ -105,6 +131,8 @@ def calibrate_from_files(
         settings: Columns of the files, and what was measured.
         progress: Callback, called with a stage and its completed fraction (0 to 1) of
             all stages.
+        clearance: Distance that shapes keep in poses that are proposed.
+        logs: Logs whose torques are compared with both geometries.
     """
     # Other commands do not wait for calibrations.
     from jaxid.calibration import rough_bodies
@@ -123,11 +151,48 @@ def calibrate_from_files(
     fit = calibrate(
         setup.robot, observations, bodies=bodies, compliance=settings.compliance
     )
+    findings = []
+    if logs is not None:
+        progress("comparing torques", 0.3)
+        findings.append(compare_torques(setup, fit.robot, logs))
     progress("holding sessions out", 0.6)
     sources: dict[str, list[Path]] = {}
     for file in files:
         sources.setdefault(file.session, []).append(file.path)
-    return calibration_report(fit, sources)
+    units = settings.radians(setup.robot)
+    return calibration_report(fit, sources, clearance, units, findings)
+
+
+def compare_torques(setup: Setup, calibrated: Robot, logs: TorqueLogs) -> Remark:
+    """Return whether a model with calibrated geometry predicts torques better."""
+    paths = [Path(path) for path in logs.paths]
+    parts = split_logs(
+        load_logs(setup, paths, logs.columns), len(paths), HELD_OUT_SHARE
+    )
+    better_setup = dataclasses.replace(
+        setup, unknowns=Model(calibrated, setup.model.terms)
+    )
+    before, after = (
+        _torque_error(geometry, parts.training_logs, parts.unseen_logs)
+        for geometry in (setup, better_setup)
+    )
+    change = after / before - 1.0
+    words = "this changes little"
+    if abs(change) > MIN_CHANGE:
+        words = "better geometry helps" if change < 0.0 else "look at the corrections"
+    text = (
+        f"Torques of {', '.join(path.name for path in paths)}, last "
+        f"{100 * HELD_OUT_SHARE:g} % of each log held out: the error is "
+        f"{percent(before, 3)} % with the nominal geometry and {percent(after, 3)} % "
+        f"with the calibrated one; {words}"
+    )
+    return Remark(text, Status.DOUBTFUL if change > MIN_CHANGE else Status.GOOD)
+
+
+def _torque_error(setup: Setup, fitted_logs: list, unseen_logs: list) -> float:
+    """Return the mean relative error of the torques of logs that are not fitted."""
+    fit = setup.fit(RegressionProblem(setup.base, fitted_logs))
+    return float(np.mean([x.relative for x in validate(fit, unseen_logs).errors]))
 
 
 def session_files(paths: list[Path]) -> Iterator[SessionFile]:
@@ -158,88 +223,66 @@ def read_observations(
     setup: Setup, files: list[SessionFile], settings: CalibrationSettings
 ) -> "list[AbstractObservation]":
     """Return the observations of all sessions."""
-    from jaxid.calibration import SocketDistance
+    from jaxid.calibration import OBSERVATIONS, MeasuredPose, SocketDistance
 
+    kinds = {**OBSERVATIONS, "eye_in_hand": MeasuredPose.eye_in_hand}
     observations: list[Any] = []
     places: dict[str, list[str]] = {}
     for file in files:
         try:
-            q, measurements = _read(setup, file.path, settings)
+            arrays = _read(setup.robot, file.path, settings)
         except InputError as error:
             # Sessions have files of the same names.
             owner = f"session `{file.session}`, {setup.robot.joints} joints"
             raise InputError(f"{owner}: {error}") from None
-        fields = {
-            **measurements,
-            "place": file.place,
-            "place_stays": settings.place_stays or settings.parts > 1,
-        }
         places.setdefault(file.session, []).append(file.place)
-        for name in ("deviation", "angle_deviation"):
-            if getattr(settings, name) is not None:
-                fields[name] = getattr(settings, name)
-        for session, rows in _parts(file.session, len(q), settings.parts):
-            part = {k: x[rows] if k in measurements else x for k, x in fields.items()}
-            observations.append(_observation(settings, session, q[rows], part))
-    if settings.observation == "point_contact" and settings.distance is not None:
-        for session, names in places.items():
-            if len(names) != 2:
-                raise InputError(
-                    "`calibration.distance` is that of two places in each session, but "
-                    f"session `{session}` has {len(names)}: leave it out."
-                )
+        poses = len(arrays["q"])
+        order = np.random.default_rng(0).permutation(poses)
+        for number, rows in enumerate(np.array_split(order, settings.parts), 1):
+            is_divided = settings.parts > 1
             observations.append(
-                SocketDistance(
-                    session,
-                    distance=settings.metres * settings.distance,
-                    place=names[0],
-                    other_place=names[1],
+                kinds[settings.observation](
+                    f"part {number}" if is_divided else file.session,
+                    **{name: x[np.sort(rows)] for name, x in arrays.items()},
+                    place=file.place,
+                    place_stays=is_divided,
                 )
             )
+    if settings.observation != "point_contact" or settings.distance is None:
+        return observations
+    for session, names in places.items():
+        if len(names) != 2:
+            raise InputError(
+                "`calibration.distance` is that of two places in each session, but "
+                f"session `{session}` has {len(names)}: leave it out."
+            )
+        observations.append(
+            SocketDistance(
+                session,
+                distance=settings.metres * settings.distance,
+                place=names[0],
+                other_place=names[1],
+            )
+        )
     return observations
 
 
-def _parts(session: str, poses: int, count: int) -> list[tuple[str, np.ndarray]]:
-    """Return a session, or random parts of it, with the rows of their poses."""
-    if count == 1:
-        return [(session, np.arange(poses))]
-    order = np.random.default_rng(0).permutation(poses)
-    rows = np.array_split(order, count)
-    return [(f"part {number}", x) for number, x in enumerate(rows, 1) if len(x)]
-
-
-def _observation(
-    settings: CalibrationSettings, session: str, q: np.ndarray, fields: dict[str, Any]
-) -> "AbstractObservation":
-    """Return the observation of one place."""
-    from jaxid.calibration import OBSERVATIONS, MeasuredPose
-
-    if settings.observation == "measured_pose" and settings.eye_in_hand:
-        return MeasuredPose.eye_in_hand(session, q, **fields)
-    return OBSERVATIONS[settings.observation](session, q, **fields)
-
-
 def _read(
-    setup: Setup, path: Path, settings: CalibrationSettings
-) -> tuple[np.ndarray, dict[str, np.ndarray]]:
-    """Return the joint coordinates of a file, and its measurements by their names."""
-    robot = setup.robot
-    joints = settings.joints
-    if joints is None:
-        joints = list(range(robot.joints))
-    selections: dict[str, Any] = {"joints": joints}
-    if settings.observation in ("measured_position", "measured_pose"):
-        selections["position"] = settings.position
-    if settings.observation == "measured_pose":
-        selections["attitude"] = settings.attitude
+    robot: Robot, path: Path, settings: CalibrationSettings
+) -> dict[str, np.ndarray]:
+    """Return the joint coordinates of a file and its measurements, as observations."""
+    first_columns = list(range(robot.joints))
+    selections: dict[str, Any] = {"joints": settings.joints or first_columns}
+    for name in MEASUREMENTS.get(settings.observation, ()):
+        selections[name] = getattr(settings, name)
     for name, columns in selections.items():
         if columns is None:
             raise InputError(
                 f"`calibration.{name}` is missing: name the columns of `{path.name}` "
                 f"for `{settings.observation}`."
             )
-        is_list = isinstance(columns, list)
-        selections[name] = tuple(columns) if is_list else columns
+        if isinstance(columns, list):
+            selections[name] = tuple(columns)
     file = open_log_file(path, selections, robot.joint_names)
     channels = file.channels()
     table = file.table(channels, False, None).read(channels)
@@ -247,20 +290,18 @@ def _read(
         name: np.concatenate([table.numbers(x) for x in columns], axis=1)
         for name, columns in channels.items()
     }
-    q = blocks["joints"]
-    if settings.angle_unit == "deg":
-        q = q * np.where(robot.revolute, np.pi / 180.0, 1.0)[: q.shape[1]]
-    measurements = {}
+    joints = blocks["joints"]
+    arrays = {"q": joints * settings.radians(robot)[: joints.shape[1]]}
     if "position" in blocks:
-        measurements["positions"] = settings.metres * blocks["position"]
+        arrays["positions"] = settings.metres * blocks["position"]
     if "attitude" in blocks:
-        measurements["rotations"] = _rotations(blocks["attitude"], path)
+        arrays["rotations"] = _rotations(blocks["attitude"], path)
     if settings.observation == "known_distance":
         if settings.distance is None:
             raise InputError("`calibration.distance` is missing: give the distance.")
-        distances = np.full(len(q), settings.metres * settings.distance)
-        measurements["distance"] = distances
-    return q, measurements
+        distance = settings.metres * settings.distance
+        arrays["distance"] = np.full(len(joints), distance)
+    return arrays
 
 
 def _rotations(numbers: np.ndarray, path: Path) -> np.ndarray:

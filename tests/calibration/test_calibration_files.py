@@ -88,7 +88,14 @@ def report(folder):
 
 def test_a_report_has_page_numbers_and_robot(report):
     names = {path.name for path in report.iterdir()}
-    assert names == {"report.html", "calibration.json", "calibration.csv", "robot.urdf"}
+    poses = "poses_to_record.csv"
+    results = {"report.html", "calibration.json", "calibration.csv", "robot.urdf"}
+    assert names == {*results, poses}
+    # Angles are in the unit of the files.
+    table = np.genfromtxt(report / poses, delimiter=",", names=True)
+    assert table.dtype.names == ("session", "j0", "j1", "j2", "j3")
+    assert len(table) == 60
+    assert 57 < max(np.abs(table[name]).max() for name in table.dtype.names[1:]) < 115
     content = json.loads((report / "calibration.json").read_text())
     assert content["schema"] == "jaxid-calibration/1"
     held_out = np.mean(content["held_out_errors"]["lengths"])
