@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Joints, Matrix, Texts, double_precision
+from jaxid.arrays import Joints, Texts, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
@@ -17,11 +17,10 @@ from jaxid.robot.robot import Robot
 
 from .feed_forward import body_parameters
 
-PROBES = 6
-"""Number of states at which a term is compared with a joint's dynamics."""
-PROBE_SPEEDS = (20.0, 80.0)
-"""Speeds of these states, beyond the transition of dry friction [rad/s or m/s]."""
-
+QUANTITIES = {"inertia": "armature", "viscous": "damping", "dry": "friction"}
+"""Quantities of simulators, by the roles of the parameters that they are made of."""
+FAST = 100.0
+"""Speed beyond the transition of dry friction [rad/s or m/s]."""
 
 Quantities = Mapping[str, Joints]
 """One number for each joint, by the names of the quantities."""
@@ -43,79 +42,47 @@ class JointDynamics(NamedTuple):
 
 
 def joint_dynamics(fit: Fit) -> JointDynamics:
-    r"""Return inertia and friction at the joints, as far as simulators know them.
+    """Return inertia and friction at the joints, as far as simulators know them.
 
-    They follow from the columns of the terms: a parameter belongs to a joint if its
-    forces, as the mean of both directions, are $a \ddot q_j + b \dot q_j + c\,
-    \mathrm{sign}(\dot q_j)$ at all speeds beyond the transition of dry friction.
+    They are parameters with a role in the physics of a drive; friction is the mean of
+    both directions.
     """
     model = fit.base.model
     robot = model.robot
-    total = np.zeros((3, robot.joints))
+    values = {name: np.zeros(robot.joints) for name in QUANTITIES.values()}
     rotors = []
     omissions = [] if model.memory is None else ["the memory of dry friction"]
     for term, p in model.split(fit.standard_parameters):
         if term.body_parameters:
             continue
-        coefficients = _joint_coefficients(term, robot)
-        total += coefficients @ np.asarray(p)
-        for k, (name, _) in enumerate(term.parameters(robot)):
-            if coefficients[0, :, k].any():
+        names = [name for name, _ in term.parameters(robot)]
+        roles = np.repeat(
+            [x.role or "" for x in term.joint_parameters], len(robot.driven)
+        )
+        # Other parameters, such as those of ripple, have no role.
+        roles = np.append(roles, [""] * (len(names) - len(roles)))
+        for role, quantity in QUANTITIES.items():
+            columns = np.where(roles == role, _unit_forces(term, robot, role), 0.0)
+            values[quantity] += columns @ np.asarray(p)
+        for name, role in zip(names, roles, strict=True):
+            if role == "inertia":
                 rotors.append(name)
-            if not coefficients[:, :, k].any():
+            if role not in QUANTITIES:
                 omissions.append(name)
-    values: Quantities = {
-        "armature": total[0],
-        "damping": total[1],
-        "friction": total[2],
-    }
     return JointDynamics(values, tuple(rotors), tuple(omissions))
 
 
-def _joint_coefficients(term: AbstractTerm, robot: Robot) -> np.ndarray:
-    """Return inertia, viscous and dry friction of unit parameters, or zeros.
-
-    The axes are these three, the joints, and the parameters of the term.
-    """
-    random = np.random.default_rng(0)
-    shape = (PROBES, robot.joints)
-    q, qdd = random.uniform(-1.0, 1.0, (2, *shape))
-    speeds = random.uniform(*PROBE_SPEEDS, shape)
-    directions = random.choice([-1.0, 1.0], shape)
-    qd = speeds * directions
-
-    columns = _odd_columns(term, robot, q, qd, qdd)
-    coefficients = np.zeros((3, *columns.shape[1:]))
-    is_used = np.any(columns, axis=0)
-    # A simulator knows no parameter that acts on several joints.
-    acts_on_one_joint = np.count_nonzero(is_used, axis=0) == 1
-    for joint, k in np.argwhere(is_used & acts_on_one_joint):
-        acceleration = qdd[:, joint]
-        velocity = qd[:, joint]
-        direction = directions[:, joint]
-        basis = np.stack([acceleration, velocity, direction], axis=1)
-        forces = columns[:, joint, k]
-        solution = np.linalg.lstsq(basis, forces)[0]
-        error = np.abs(basis @ solution - forces)
-        if error.max() < 1e-9:
-            coefficients[:, joint, k] = solution.round(12)
-    return coefficients
-
-
-def _odd_columns(
-    term: AbstractTerm, robot: Robot, q: Matrix, qd: Matrix, qdd: Matrix
-) -> np.ndarray:
-    """Return the part of a term's columns that changes its sign with the motion.
-
-    Springs and offsets drop out, and friction is the mean of both directions.
-    """
-    columns = []
+def _unit_forces(term: AbstractTerm, robot: Robot, role: str) -> np.ndarray:
+    """Return the forces of unit parameters for a unit of what their role acts on."""
+    standstill = np.zeros(robot.joints)
+    motion = np.ones(robot.joints)
     with double_precision():
-        for x, v, a in zip(q, qd, qdd, strict=True):
-            forward_column = np.asarray(term.columns(robot, x, v, a))
-            backward_column = np.asarray(term.columns(robot, x, -v, -a))
-            columns.append(0.5 * (forward_column - backward_column))
-    return np.array(columns)
+        if role == "inertia":
+            return np.asarray(term.columns(robot, standstill, standstill, motion))
+        forward_forces = term.columns(robot, standstill, FAST * motion, standstill)
+        backward_forces = term.columns(robot, standstill, -FAST * motion, standstill)
+        mean_forces = 0.5 * np.asarray(forward_forces - backward_forces)
+    return mean_forces / FAST if role == "viscous" else mean_forces
 
 
 def feasible_bodies(fit: Fit, target: str) -> BodyParameters:

@@ -231,6 +231,11 @@ class HeldOutPrediction(NamedTuple):
     measured: Matrix
     errors: Matrix
 
+    @property
+    def predicted(self) -> Matrix:
+        """Predicted forces [N m or N]."""
+        return self.measured + self.errors
+
 
 def relative_error(predictions: Sequence[HeldOutPrediction]) -> float:
     """Return the RMS of all errors over the RMS of all forces."""

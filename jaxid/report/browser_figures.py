@@ -24,8 +24,6 @@ SCENE_HEIGHT = 560
 """Height of a robot in space [px]."""
 COLOUR_PERCENTILE = 98.0
 """Share of the values of a scene that are within its scale of colours [%]."""
-GAP_COUNT = 65535
-"""Largest count of two bytes, which marks a gap."""
 LENGTH_DIGITS = 4
 """Decimals of vertices and origins of solids [m]."""
 
@@ -92,11 +90,9 @@ def _curve_content(curve: Curve, panel: Panel) -> Content:
     """Return a curve with its points packed; a line in time is decimated."""
     x = curve.x
     y = curve.y
-    packed = _floats
     if panel.in_time and curve.kind == "line":
         x, y = decimate(x, y)
-        packed = _steps
-    content = {**vars(curve), "x": packed(x), "y": packed(y)}
+    content = {**vars(curve), "x": _floats(x), "y": _floats(y)}
     if curve.low is not None:
         content["low"] = _floats(curve.low)
         content["high"] = _floats(curve.high)
@@ -141,31 +137,13 @@ def _solids_content(solids: Solids) -> Content:
         "vertices": solids.vertices.round(LENGTH_DIGITS).tolist(),
         "bodies": solids.bodies.tolist(),
         "faces": solids.faces.tolist(),
-        "places": [_steps(place) for place in places],
+        "places": [_floats(place) for place in places],
     }
 
 
 def _coordinates(points: np.ndarray) -> Content:
     """Return the coordinates of points by their axes, as plotly takes them."""
-    return {axis: _steps(points[:, k]) for k, axis in enumerate("xyz")}
-
-
-def _steps(values: Any) -> Content:
-    """Return numbers as counts of steps of their range, packed; a gap is the last."""
-    array = np.asarray(values, np.float64)
-    finite_values = array[np.isfinite(array)]
-    if not len(finite_values):
-        finite_values = np.zeros(1)
-    low = float(finite_values.min())
-    span = float(finite_values.max()) - low
-    step = span / (GAP_COUNT - 1) or 1.0
-    counts = np.where(np.isfinite(array), (array - low) / step, GAP_COUNT)
-    packed_counts = counts.round().astype("<u2").tobytes()
-    return {
-        "low": low,
-        "step": step,
-        "counts": base64.b64encode(packed_counts).decode(),
-    }
+    return {axis: _floats(points[:, k]) for k, axis in enumerate("xyz")}
 
 
 def _floats(values: Any) -> dict[str, str]:

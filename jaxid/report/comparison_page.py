@@ -11,10 +11,10 @@ from jaxid.robot.robot import Robot
 from jaxid.validation.torque_errors import TorqueErrors
 
 from .comparison_figure import comparison_figure
-from .forces_of_models import model_force_figure
 from .page import Section, Settings, provenance, render_page, tiles
 from .result_files import write_page_and_table
 from .result_records import comparison_rows, error_record
+from .torques import model_force_figure
 
 ONE_MOTION = (
     "Effects that the model lacks also cause differences between runs with different "
@@ -107,7 +107,7 @@ class ComparisonReport(Summarised):
         ]
         glance = [
             self.verdict,
-            tiles(*((*number, Status.NEUTRAL) for number in self.numbers)),
+            tiles(*self.numbers),
             self.remarks,
         ]
         sections: list[Section] = [("At a glance", glance)]

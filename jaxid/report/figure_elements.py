@@ -63,9 +63,8 @@ class Panel:
     y: str = ""  # label of the ordinate
     unit: str = ""  # unit of the ordinate
     log: str = ""  # logarithmic axes: `x`, `y` or both
-    # limits of abscissa and ordinate; those of the curves if None
+    # limits of the abscissa; those of the curves if None
     x_range: tuple[float, float] | None = None
-    y_range: tuple[float, float] | None = None
     # names of the abscissas 0, 1, …, instead of numbers
     x_names: Sequence[str] = ()
     # names of the ordinates 0, 1, … from the top, instead of numbers

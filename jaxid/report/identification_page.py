@@ -27,7 +27,6 @@ from jaxid.validation.torque_errors import (
 )
 
 from .figure import Figure
-from .friction_and_gravity import gravity_table
 from .joint_estimates import correlation_blocks, joint_table
 from .page import Section, folded, picture, provenance, render_page, tiles
 from .parameter_words import FRAMES_NOTE, word_columns
@@ -99,18 +98,14 @@ def _three_numbers(report: Report) -> Markup:
         (
             f"{percent(relative_error(logs))} %",
             f"torque error (RMS over RMS){band} {motion}",
-            Status.NEUTRAL,
         ),
         (
             f"{percent(float(errors[worst_joint]))} %",
             f"the same for the worst joint, {joint_name}",
-            Status.NEUTRAL,
         ),
         (
             f"{fit.base.size - undetermined} of {fit.base.size}",
             "combinations of parameters that the logs determine",
-            # The logs of the fit praise no model.
-            Status.DOUBTFUL if undetermined else Status.NEUTRAL,
         ),
     )
 
@@ -134,7 +129,7 @@ def _log_size(log: TorqueErrors) -> str:
 def _physics(report: Report, figures: Figures) -> Sections:
     """Yield sections on what the model says of the robot.
 
-    They show the robot in motion, its torques before and after, friction and gravity.
+    They show the robot in motion, its torques before and after, and friction.
     """
     text = (
         "The colour of a link shows the torque error of the joint that moves it; the "
@@ -155,11 +150,6 @@ def _physics(report: Report, figures: Figures) -> Sections:
         "choose` tries further laws."
     )
     yield "Friction", [text, figures["friction"]]
-    if report.fit.base.model.robot.floating:
-        # An accelerometer measures gravity, which the model then does not know.
-        return
-    log = report.verification[0] if report.verification else report.identification[0]
-    yield "Gravity", [gravity_table(report.fit, log)]
 
 
 def _torques(figures: Figures, robot: Robot) -> list[Any]:

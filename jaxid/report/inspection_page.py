@@ -45,16 +45,14 @@ def write_inspection(
     undetermined = max(len(fit.undetermined) for _, fit in logs)
     residual = percent(max(fit.residual for _, fit in logs))
     numbers = tiles(
-        (str(len(findings)), "findings to look at", Status.NEUTRAL),
+        (str(len(findings)), "findings to look at"),
         (
             f"{residual} %",
             "of the forces that a fit to the log does not explain",
-            Status.NEUTRAL,
         ),
         (
             f"{size - undetermined} of {size}",
             "combinations of parameters that the log determines",
-            Status.NEUTRAL,
         ),
     )
     sections: list[Section] = [("At a glance", [verdict, numbers, findings])]

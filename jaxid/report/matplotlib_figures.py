@@ -111,7 +111,6 @@ def _draw_panel(axes: Axes, panel: Panel) -> None:
     axes.set_title(panel.value, loc="right", color=GREY, fontsize=8)
     axes.set_ylabel(panel.y_label)
     axes.set_xlim(panel.x_range)
-    axes.set_ylim(panel.y_range)
     if panel.share < 1.0:
         axes.yaxis.set_major_locator(MaxNLocator(3, symmetric=True))
     if panel.x_names:

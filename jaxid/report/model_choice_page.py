@@ -10,13 +10,13 @@ from jaxid.identification.model_selection import (
     relative_error,
 )
 from jaxid.io import write_text
-from jaxid.result_table import Status, Table, percent
+from jaxid.result_table import Table, percent
 from jaxid.robot.robot import Robot
 
 from .figure import Figure
 from .figure_elements import GREY, PREDICTION_COLOUR, Curve, Panel
-from .forces_of_models import model_force_figure
 from .page import Settings, provenance, render_page, tiles
+from .torques import model_force_figure
 
 FIRST_MODEL = "file as it is"
 CHOSEN_MODEL = "chosen model"
@@ -32,13 +32,12 @@ def write_model_choice(
     first_error = percent(relative_error(choice.first_predictions))
     sizes = f"{choice.path[0].size} → {choice.chosen.size}"
     numbers = tiles(
-        (f"{error} %", "error of the chosen model (RMS over RMS)", Status.NEUTRAL),
+        (f"{error} %", "error of the chosen model (RMS over RMS)"),
         (
             f"{first_error} %",
             "error of the model as the file says",
-            Status.NEUTRAL,
         ),
-        (sizes, "number of parameters: file as it is → chosen model", Status.NEUTRAL),
+        (sizes, "number of parameters: file as it is → chosen model"),
     )
     sections = [
         ("At a glance", [verdict, numbers, remarks]),

@@ -10,7 +10,6 @@ from markupsafe import Markup
 
 from jaxid.result_table import (
     Remark,
-    Status,
     Table,
     in_html,
     macros,
@@ -77,8 +76,8 @@ def picture(figure: Drawing, caption: str = "") -> Markup:
     return _macros().figure(figure, charts(figure), caption)
 
 
-def tiles(*numbers: tuple[str, str, Status]) -> Markup:
-    """Return a block with large texts, what each of them is, and their judgement."""
+def tiles(*numbers: tuple[str, str]) -> Markup:
+    """Return a block with large texts, and what each of them is."""
     return _macros().tiles(numbers)
 
 

@@ -19,11 +19,11 @@ from jaxid.validation.torque_errors import TorqueErrors, relative_error
 from .comparison_figure import comparison_figure
 from .figure import Figure
 from .figure_elements import CYCLE, GREY, Curve, Panel
-from .forces_of_models import model_force_figure
-from .friction_and_gravity import friction_figure
+from .friction_figures import friction_figure
 from .motion_figures import pose_figure, surface_points
 from .parameter_words import FRAMES_NOTE
 from .several_runs_report import Answer
+from .torques import model_force_figure
 
 Errors = Sequence[TorqueErrors]
 """Torque errors on some logs."""

@@ -8,7 +8,7 @@ explore, or `.png`, `.pdf` or `.svg`; `matplotlib()` returns a
 """
 
 from .comparison_figure import comparison_figure as comparison
-from .friction_and_gravity import friction_figure as friction
+from .friction_figures import friction_figure as friction
 from .motion_figures import (
     joint_figure as joints,
     pose_figure as poses,

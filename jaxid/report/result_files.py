@@ -16,7 +16,7 @@ from jaxid.result_table import Status
 from jaxid.validation.judgement import Report
 
 from .figure import Figure
-from .friction_and_gravity import error_scene, friction_figure
+from .friction_figures import error_scene, friction_figure
 from .identification_page import identification_page
 from .residual_spectra import residual_figure
 from .result_records import (

@@ -97,7 +97,7 @@ class RunsReport(Summarised):
         record["verdict"] = verdict_rows([self.verdict, *remarks])
         glance = [
             self.verdict,
-            tiles(*((*x, Status.NEUTRAL) for x in self.answer.numbers)),
+            tiles(*self.answer.numbers),
             Table("", facts=facts),
             [remark for remark in remarks if remark != self.verdict],
         ]

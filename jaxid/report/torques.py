@@ -5,6 +5,7 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 
 from jaxid.errors import InputError
+from jaxid.identification.model_selection import HeldOutPrediction
 from jaxid.result_table import percent, significant
 from jaxid.robot.robot import Robot
 from jaxid.validation.torque_errors import (
@@ -16,7 +17,6 @@ from jaxid.validation.torque_errors import (
 from .figure import Figure
 from .figure_elements import (
     BLUE,
-    ERROR,
     GREEN,
     GREY,
     MEASUREMENT_COLOUR,
@@ -31,6 +31,12 @@ MAX_BARS_WITH_NUMBERS = 20
 """Largest number of bars on which their values are written."""
 GROUP_COLOURS = (BLUE, ORANGE, GREEN, PURPLE)
 """Colours of the groups of recordings beside each other."""
+MODEL_COLOURS = (PREDICTION_COLOUR, BLUE)
+"""Colours of what one or two models predict."""
+
+
+Predictions = Mapping[str, HeldOutPrediction | TorqueErrors]
+"""Predictions of one or two models for one log, by their names."""
 
 
 def torque_figure(
@@ -57,55 +63,78 @@ def torque_figure(
     joints = range(robot.joints) if joints is None else joints
     rows = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
     window = slice(rows[0], rows[-1] + 1)
-    panels = [_joint_panel(errors, robot, j, window) for j in joints]
-    columns = 2 if len(panels) > 2 else 1
+    panels = [
+        force_panel(
+            {"predicted": errors}, robot, j, window, _error_text(errors, robot, j)
+        )
+        for j in joints
+    ]
     name = errors.name if title is None else title
-    return Figure(
-        f"{name}: RMS error {percent(errors.relative)} % of the RMS forces"
-        f"{errors.band_words}",
-        panels,
-        columns,
-        height=2.6,
-    )
+    title = f"{name}: RMS error {percent(errors.relative)} % of the RMS forces"
+    return _force_figure(f"{title}{errors.band_words}", panels)
 
 
-def _joint_panel(errors: TorqueErrors, robot: Robot, j: int, window: slice) -> Panel:
-    """Return forces of a joint, with the errors in a panel below."""
-    unit = robot.force_unit(j)
-    time = np.asarray(errors.time)[window]
-    measured_forces = np.asarray(errors.measured)[window, j]
-    predicted_forces = np.asarray(errors.predicted)[window, j]
-    difference = errors.errors[window, j]
-    limit = 1.1 * (np.fmax.reduce(np.abs(difference), initial=0.0) or 1.0)
+def model_force_figure(predictions: Predictions, robot: Robot, title: str) -> Figure:
+    """Return the measured forces of each joint, those of two models, and their errors.
+
+    Args:
+        predictions: What each model predicts, by its name; all of one log.
+        robot: Robot of the log.
+        title: Title of the figure.
+    """
+    errors = np.asarray(next(iter(predictions.values())).errors)
+    # Forces of some joints may not be measured.
+    is_measured = np.isfinite(errors).any(axis=0)
+    joints = np.flatnonzero(is_measured).tolist()
+    return _force_figure(title, [force_panel(predictions, robot, j) for j in joints])
+
+
+def _force_figure(title: str, panels: Sequence[Panel]) -> Figure:
+    return Figure(title, panels, columns=2 if len(panels) > 2 else 1, height=2.8)
+
+
+def force_panel(
+    predictions: Predictions,
+    robot: Robot,
+    joint: int,
+    rows: slice = slice(None),
+    value: str = "",
+) -> Panel:
+    """Return the forces of a joint, with the errors of the models in a panel below."""
+    unit = robot.force_unit(joint)
+    log = next(iter(predictions.values()))
+    time = np.asarray(log.time)[rows]
+    measured_forces = np.asarray(log.measured)[rows, joint]
+    curves = [Curve(time, measured_forces, "measured", MEASUREMENT_COLOUR, width=1.9)]
+    error_curves = []
+    for (name, prediction), colour in zip(
+        predictions.items(), MODEL_COLOURS, strict=False
+    ):
+        predicted_forces = np.asarray(prediction.predicted)[rows, joint]
+        errors = np.asarray(prediction.errors)[rows, joint]
+        curves.append(Curve(time, predicted_forces, name, colour, width=0.8))
+        error_curves.append(Curve(time, errors, name, colour, width=0.6))
     error_panel = Panel(
-        [Curve(time, difference, "predicted - measured", ERROR, width=0.6)],
-        unit=unit,
-        y_range=(-limit, limit),
-        levels=[("y", 0.0, GREY)],
-        share=0.4,
+        error_curves, y="error", unit=unit, levels=[("y", 0.0, GREY)], share=0.5
     )
-    # A single row has no duration.
-    end = time[-1] if len(time) > 1 else time[0] + 1.0
     return Panel(
-        [
-            Curve(time, measured_forces, "measured", MEASUREMENT_COLOUR, width=1.9),
-            Curve(time, predicted_forces, "predicted", PREDICTION_COLOUR, width=0.8),
-        ],
-        title=robot.joint_names[j],
-        value=_error_text(errors, j, unit),
-        y="torque" if robot.revolute[j] else "force",
+        curves,
+        title=robot.joint_names[joint],
+        value=value,
+        y="torque" if robot.revolute[joint] else "force",
         unit=unit,
-        x_range=(float(time[0]), float(end)),
         below=[error_panel],
     )
 
 
-def _error_text(errors: TorqueErrors, j: int, unit: str) -> str:
+def _error_text(errors: TorqueErrors, robot: Robot, j: int) -> str:
     """Return a joint's RMS error, and its share of the RMS force."""
     if not np.isfinite(errors.errors[:, j]).any():
         return "no row counts"
     share = percent(float(errors.rms_relative[j]))
-    return f"RMS error {significant(errors.rms[j], 2)} {unit} = {share} %"
+    return (
+        f"RMS error {significant(errors.rms[j], 2)} {robot.force_unit(j)} = {share} %"
+    )
 
 
 def require_joints(errors: TorqueErrors, robot: Robot) -> None:

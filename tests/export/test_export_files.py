@@ -400,15 +400,18 @@ class Drag(jid.terms.AbstractTerm):
         return jnp.stack([*parts, q[0] * one[0]], axis=1)
 
 
-def test_joint_friction_is_read_from_the_terms_of_a_user(fit):
-    model = jid.Model(fit.base.model.robot, (jid.RigidBodies(), Drag()))
-    p = np.concatenate(
-        [possible(jid.Model(model.robot, model.terms[:1])), [2.0, 4.0, 1.0, 9, 9]]
-    )
+def test_joint_friction_is_that_of_parameters_with_a_role(fit):
+    warm = jid.terms.TemperatureScaled(jid.ViscousFriction(), 0.02, temperature=40.0)
+    terms = (jid.RigidBodies(), warm, jid.terms.AsymmetricCoulombFriction(), Drag())
+    model = jid.Model(fit.base.model.robot, terms)
+    bodies = possible(jid.Model(model.robot, terms[:1]))
+    forces = [2.0, 4.0, 1.0, 3.0, 3.0, 3.0, 1.0, 2.0, 3.0, 9, 9, 9, 9, 9]
+    p = np.concatenate([bodies, forces])
     joints, _, left_out = joint_dynamics(fit_of(model, p, full=True))
-    np.testing.assert_allclose(joints["damping"], [2.0, 0.0, 0.0], atol=1e-12)
-    np.testing.assert_allclose(joints["friction"], [0.0, 2.5, 0.0], atol=1e-12)
-    assert left_out == ("x3", "s1")
+    cooled = np.exp(-0.02 * 15.0) * np.array([2.0, 4.0, 1.0])
+    np.testing.assert_allclose(joints["damping"], cooled, rtol=1e-12)
+    np.testing.assert_allclose(joints["friction"], [2.0, 2.5, 3.0], rtol=1e-12)
+    assert left_out == tuple(name for name, _ in Drag().parameters(model.robot))
 
 
 def as_urdf(fit, path):

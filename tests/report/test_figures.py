@@ -15,7 +15,6 @@ import jaxid as jid
 from jaxid.identification.uncertainty import ResidualSpectra
 from jaxid.report.browser_figures import charts, library
 from jaxid.report.figure_elements import BLUE, ORANGE, decimate
-from jaxid.report.friction_and_gravity import gravity_forces
 from jaxid.report.motion_figures import pose_figure
 from jaxid.report.parameter_words import in_words
 from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
@@ -38,11 +37,7 @@ def unpacked(figure):
 
 
 def numbers(packed):
-    if "floats" in packed:
-        return np.frombuffer(base64.b64decode(packed["floats"]), "<f4")
-    counts = np.frombuffer(base64.b64decode(packed["counts"]), "<u2")
-    values = packed["low"] + packed["step"] * counts
-    return np.where(counts == 65535, np.nan, values)
+    return np.frombuffer(base64.b64decode(packed["floats"]), "<f4")
 
 
 def texts_of(figure):
@@ -81,16 +76,16 @@ def test_torques_show_what_was_measured_and_predicted(fit, validation):
         )
         np.testing.assert_array_equal(lower.curves[0].y, errors.errors[:, j])
         assert upper.title == robot.joint_names[j]
-        assert (upper.y_label, lower.y_label) == (f"{word} [{unit}]", f"[{unit}]")
+        assert (upper.y_label, lower.y_label) == (f"{word} [{unit}]", f"error [{unit}]")
         said = upper.value.split(f" {unit} = ")[1].split(" %")[0]
         assert float(said) == pytest.approx(100 * errors.rms_relative[j], rel=0.06)
     require_everything_inside(figure)
-    names = [curve.name for curve in figure.legend]
+    assert [curve.name for curve in figure.legend] == ["measured", "predicted"]
     for shown, j in zip(unpacked(figure), range(2), strict=True):
-        assert [drawn["name"] for drawn in shown["curves"]] == names
+        names = [drawn["name"] for drawn in shown["curves"]]
+        assert names == ["measured", "predicted", "predicted"]
         y = numbers(shown["curves"][0]["y"])
-        half_step = 0.5 * np.ptp(errors.measured[:, j]) / 65534 * 1.001
-        np.testing.assert_allclose(y, errors.measured[:, j], rtol=0, atol=half_step)
+        np.testing.assert_allclose(y, errors.measured[:, j], rtol=1e-7)
         assert [drawn["panel"] for drawn in shown["curves"]] == [0, 0, 1]
 
 
@@ -102,8 +97,8 @@ def test_a_page_keeps_the_peaks_of_a_long_log(errors_of):
         numbers(drawn["y"]) for drawn in second["curves"]
     )
     assert len(measured) <= 2400
-    assert predicted.max() == pytest.approx(1e4, rel=1e-12)
-    assert difference.max() == pytest.approx(errors.errors[:, 1].max(), rel=1e-12)
+    assert predicted.max() == pytest.approx(1e4, rel=1e-7)
+    assert difference.max() == pytest.approx(errors.errors[:, 1].max(), rel=1e-7)
     assert [second["curves"][k]["x"] for k in (1, 2)] == [0, 0], "the same abscissas"
     times = numbers(second["curves"][0]["x"])
     assert abs(times[np.argmax(predicted)] - errors.time[40_001]) < 600.0 / 600
@@ -291,16 +286,6 @@ def test_friction_is_that_of_the_estimates_and_of_the_log(fit, validation):
         band = curve(panel, "95 % band")
         assert (band.low <= model.y).all()
         assert (band.high >= model.y).all()
-
-
-def test_weight_is_the_slope_of_the_potential_energy(fit):
-    p = dict(zip(fit.base.names, np.asarray(fit.parameters), strict=True))
-    q = np.stack([np.linspace(-1.0, 1.0, 9), np.linspace(-2.0, 2.0, 9)], axis=1)
-    # The pendulum turns about y: its centre of mass has the height z cos q - x sin q.
-    slope = -9.81 * (p["mx2"] * np.cos(q[:, 1]) + p["mz2"] * np.sin(q[:, 1]))
-    found = gravity_forces(fit, q)
-    np.testing.assert_allclose(found[:, 1], slope, atol=1e-9)
-    np.testing.assert_allclose(found[:, 0], 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize(

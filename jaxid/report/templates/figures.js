@@ -26,11 +26,9 @@
 
   const bytesOf = (text) => Uint8Array.from(atob(text), (c) => c.charCodeAt(0)).buffer;
 
-  // Numbers come in single precision, or as counts of steps; the largest count is a gap.
+  // Numbers come in single precision.
   function numbers(key, value) {
-    if (value?.floats !== undefined) return new Float32Array(bytesOf(value.floats));
-    if (value?.counts === undefined) return value;
-    return Float64Array.from(new Uint16Array(bytesOf(value.counts)), (count) => (count === 65535 ? NaN : value.low + value.step * count));
+    return value?.floats === undefined ? value : new Float32Array(bytesOf(value.floats));
   }
 
   const looks = {
@@ -87,7 +85,7 @@
     panels.forEach((panel, k) => {
       const bottom = Math.max(0, top - panel.share / total), names = panel.y_names;
       axes[`yaxis${axisNumber(k)}`] = {
-        ...axis(panel.y_label, panel.y_range, panel.log.includes("y"), names), domain: [k + 1 < panels.length ? bottom + gap : 0, top],
+        ...axis(panel.y_label, undefined, panel.log.includes("y"), names), domain: [k + 1 < panels.length ? bottom + gap : 0, top],
         ...(names.length && { range: [names.length - 0.4, -0.6] }), ...(panel.share < 1 && { nticks: 4 }),
       };
       top = bottom;

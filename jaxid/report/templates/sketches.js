@@ -100,7 +100,7 @@ const sketches = (() => {
     const zero = curves.some((curve) => curve.kind === "bars") ? [{ y: [0] }] : [];
     // The axis holds its limits, too, as that of plotly does.
     const limits = { y: panel.levels.filter(([which]) => which === "y").map(([, value]) => value) };
-    const range = panel.y_range || rangeOf([...curves, ...zero, limits], keys, logarithmic);
+    const range = rangeOf([...curves, ...zero, limits], keys, logarithmic);
     return axisBetween(range, bottom, top, { logarithmic, count: panel.share < 1 ? 2 : 4 });
   }
 

@@ -1,4 +1,4 @@
-"""Figures of a model's view of its robot: friction, gravity, errors along a motion."""
+"""Figures of a model's view of its robot: friction, and errors along a motion."""
 
 from collections.abc import Sequence
 
@@ -8,23 +8,19 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit_result import Fit
 from jaxid.program.sample_methods import in_numpy
-from jaxid.result_table import Column, Table, percent, significant
+from jaxid.result_table import significant
 from jaxid.robot.collision_geometry import BodyShape
 from jaxid.robot.joint_coordinates import reachable
 from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import Figure
 from .figure_elements import BLUE, GREY, MEASUREMENT_COLOUR, Curve, Panel
-from .motion_figures import even_indices, pose_figure, surface_points
+from .motion_figures import pose_figure, surface_points
 
-MAX_POSES = 2000
-"""Largest number of poses whose gravity torques are computed."""
 SPEED_CLASSES = 24
 """Classes of speed whose mean friction is shown."""
 MIN_CLASS_ROWS = 5
 """Smallest number of rows whose mean friction is shown."""
-ROUNDING = 1e-9
-"""Gravity torque that is only rounding, relative to that of the heaviest joint."""
 
 
 def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
@@ -130,33 +126,6 @@ def _measured_friction(model: Curve, speeds: np.ndarray, errors: np.ndarray) -> 
     mean_friction = friction_sums[is_shown] / counts[is_shown]
     name = "measured, mean in a range of speeds"
     return Curve(mean_speeds, mean_friction, name, GREY, "points")
-
-
-def gravity_table(fit: Fit, log: TorqueErrors) -> Table:
-    """Return the largest force against gravity of each joint along a recording."""
-    robot = fit.base.model.robot
-    q = np.asarray(log.positions)[even_indices(len(log.time), MAX_POSES)]
-    torques = gravity_forces(fit, q)
-    max_torques = np.max(np.abs(torques), axis=0)
-    is_rounding = max_torques < ROUNDING * np.max(max_torques)
-    max_torques[is_rounding] = 0.0
-    columns = [
-        Column("joint", robot.joint_names),
-        Column("largest torque\nof gravity", max_torques),
-        Column("unit", [robot.force_unit(j) for j in range(robot.joints)]),
-    ]
-    shares = max_torques / np.asarray(log.max_forces)
-    if np.isfinite(shares).all():
-        columns.append(Column("share of the\ndrive's largest", shares, "%", percent))
-    return Table("", *columns)
-
-
-def gravity_forces(fit: Fit, q: np.ndarray) -> np.ndarray:
-    """Return the forces of the drives against gravity at standstill [N m or N]."""
-    base = fit.base
-    # Friction and offsets act at standstill, too, and are no part of gravity.
-    p = np.where(_is_of_body(base), fit.parameters, 0.0)
-    return _steady_columns(base, q, np.zeros_like(q)) @ p
 
 
 def _is_of_body(base: BaseParameters) -> np.ndarray:
