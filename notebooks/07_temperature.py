@@ -19,10 +19,10 @@ np.set_printoptions(precision=4, suppress=True)
 plt.style.use("notebook.mplstyle")
 
 # %% [markdown]
-# ## An hour of motion
+# ## Friction falls with temperature
 #
-# Friction turns the drives' work into heat; the heat stays in the gear for some ten minutes; warmer gears have less friction and produce less heat. After half an hour little
-# changes.
+# Friction turns the drives' work into heat, which stays in the gears for some ten minutes; after half an hour of motion little changes. The virtual robot has
+# published friction at two temperatures, here taken as 20 and 45 °C.
 
 # %%
 cold = jid.simulation.virtual_tx90l_on_rail()
@@ -31,19 +31,20 @@ motions = [
     jid.trajectories.random_fourier_series(robot, omega=0.8, seed=k, reach=0.9)
     for k in (1, 2, 3)
 ]
-times, temperatures = cold.warming(motions[0], duration=3600.0)
-
-figure, panels = plt.subplots(1, 2, figsize=(11, 3.0))
-panels[0].plot(times / 60, temperatures, label=robot.joint_names)
-panels[0].set_xlabel("time of motion [min]")
-panels[0].set_ylabel("temperature of the gear [°C]")
-panels[0].legend(ncols=2, fontsize=7)
+temperatures = np.linspace(20.0, 50.0, 31)
 fallen = [cold.at(T).parameters for T in temperatures]
 kept = [list(cold.model.parameter_names).index(f"fv{j + 1}") for j in range(7)]
-panels[1].plot(times / 60, 100 * np.array(fallen)[:, kept] / cold.parameters[kept])
-panels[1].set_xlabel("time of motion [min]")
-panels[1].set_ylabel("viscous friction [% of the cold one]")
-panels[1].set_ylim(0, 105)
+
+figure, panel = plt.subplots(figsize=(7, 3.0))
+panel.plot(
+    temperatures,
+    100 * np.array(fallen)[:, kept] / cold.parameters[kept],
+    label=robot.joint_names,
+)
+panel.set_xlabel("temperature of the gear [°C]")
+panel.set_ylabel("viscous friction [% of the cold one]")
+panel.set_ylim(0, 105)
+panel.legend(ncols=2, fontsize=7)
 plt.show()
 
 # %% [markdown]

@@ -196,25 +196,19 @@ class LuGreFriction(AbstractGearFriction):
 
 
 class FrictionTemperature(eqx.Module):
-    r"""Dependence of friction on temperature, and the heat of friction (Sec. 6).
+    r"""Dependence of friction on the temperature of the gears (Sec. 6).
 
     Viscous friction is multiplied by $e^{-a (T - T_0)}$, the law of
-    `TemperatureScaled`, and dry friction by the same with its own rate. The gear stores
-    heat: $t_h \dot T = R P - (T - T_a)$ with the friction's power $P$.
+    `TemperatureScaled`, and dry friction by the same with its own rate.
 
     Attributes:
         viscous_rate: $a$ of the viscous friction [1/K].
         dry_rate: $a$ of the dry friction [1/K].
-        resistance: Thermal resistance $R$ from each gear to the air [K/W].
-        time: Time constant $t_h$ [s].
-        reference: Temperature $T_0$ at which the friction is known, and $T_a$ of the
-            air [°C].
+        reference: Temperature $T_0$ at which the friction is known [°C].
     """
 
     viscous_rate: Joints
     dry_rate: Joints
-    resistance: Joints
-    time: float = 600.0
     reference: float = 20.0
 
     def factors(self, temperature: Joints) -> tuple[np.ndarray, np.ndarray]:
@@ -223,15 +217,6 @@ class FrictionTemperature(eqx.Module):
         viscous_factors = np.exp(-self.viscous_rate * rise)
         dry_factors = np.exp(-self.dry_rate * rise)
         return viscous_factors, dry_factors
-
-    def warm_up(
-        self, temperature: Joints, power: Joints, duration: float
-    ) -> np.ndarray:
-        """Return temperatures [°C] after a time [s] of constant friction power [W]."""
-        rise = np.asarray(self.resistance) * np.asarray(power)
-        final_temperature = self.reference + rise
-        difference = np.asarray(temperature) - final_temperature
-        return final_temperature + difference * np.exp(-duration / self.time)
 
 
 class TorqueRipple(Hashable):

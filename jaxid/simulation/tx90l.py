@@ -43,7 +43,7 @@ def virtual_tx90l_on_rail(
     p_B(34) and p_B(35) of its base parameters are the published ones, cold or warm.
     Bodies and gears can exist; products of inertia vanish, as that layout assumes. The
     paper's two identifications differ slightly in p_B(1) and p_B(2) too: so do the two
-    robots, but `at` and `warmed` change friction only.
+    robots, but `at` changes friction only.
 
     Args:
         warm: Robot after half an hour of fast motion, instead of right after its start.
@@ -131,7 +131,6 @@ def _friction(robot: Robot):
     Axes whose fall is not published have that of axis 2.
     """
     max_forces = np.asarray(robot.limits.force)
-    max_speeds = np.asarray(robot.limits.velocity)
     # Fractions: cold friction of the axes 3 to 7 over the largest torques (at 1 rad/s),
     # assumed.
     viscous_friction = np.array([COLD[27], COLD[28], *(0.02 * max_forces[2:])])
@@ -140,13 +139,6 @@ def _friction(robot: Robot):
     dry_factors = _warm_factors(34, 35)
     rise = TEMPERATURES[1] - TEMPERATURES[0]
 
-    # RMS speeds, as fractions of the largest, at which the gears reach the warm
-    # temperature: those of random Fourier motions of 0.8 rad/s that use the limits.
-    # Assumed.
-    speed = np.array([0.45, 0.24, 0.21, 0.24, 0.31, 0.17, 0.21]) * max_speeds
-    # The mean size of a sine is 0.9 of its RMS.
-    dry_power = dry_friction * dry_factors * 0.9 * speed
-    power = viscous_friction * viscous_factors * speed**2 + dry_power
     friction = LuGreFriction(
         viscous=viscous_friction,
         coulomb=dry_friction,
@@ -157,7 +149,6 @@ def _friction(robot: Robot):
     heating = FrictionTemperature(
         viscous_rate=-np.log(viscous_factors) / rise,
         dry_rate=-np.log(dry_factors) / rise,
-        resistance=rise / power,
     )
     return friction, heating
 

@@ -34,8 +34,6 @@ SERVO_FREQUENCY = 8.0
 """Natural frequency of a servo's joints [Hz]."""
 SERVO_POSES = 200
 """Random poses of the mean inertia for which a servo is made."""
-WARMING_STEP = 30.0
-"""Time after which the power of friction is evaluated again [s]."""
 CLOUD_POINTS = 12
 """Point masses of a random body: enough to fill all directions."""
 CLOUD_WIDTH = 0.05
@@ -245,58 +243,6 @@ class VirtualRobot(Hashable):
             temperature=np.full(self.robot.joints, temperature, np.float64)
         )
 
-    def warming(
-        self, trajectory: AbstractTrajectory, *, duration: float
-    ) -> tuple[np.ndarray, np.ndarray]:
-        """Return temperatures of a repeated motion: friction heats the gears (Sec. 6).
-
-        Args:
-            trajectory: Repeated motion.
-            duration: Duration [s].
-
-        Returns:
-            Times from now on [s], about every 30 s, and temperatures [°C].
-
-        Raises:
-            InputError: If friction does not depend on temperature.
-            RuntimeError: If JAX runs in single precision.
-        """
-        require_float64("warming a virtual robot")
-        heating = self.heating
-        if heating is None:
-            raise InputError(
-                "friction does not depend on temperature: give the robot `heating`."
-            )
-        # The power of friction is averaged over 2000 instants of the motion.
-        _, motion = trajectory.sample(float(trajectory.duration) / 2000)
-        ones = np.ones(self.robot.joints)
-        viscous_friction = self.friction.scaled(ones, 0.0 * ones)
-        dry_friction = self.friction.scaled(0.0 * ones, ones)
-        viscous_power = mean_power(viscous_friction, motion)
-        dry_power = mean_power(dry_friction, motion)
-
-        steps = max(1, round(duration / WARMING_STEP))
-        temperature = np.asarray(self.temperature)
-        temperatures = [temperature]
-        for _ in range(steps):
-            viscous_factors, dry_factors = heating.factors(temperature)
-            power = viscous_factors * viscous_power + dry_factors * dry_power
-            temperature = heating.warm_up(temperature, power, duration / steps)
-            temperatures.append(temperature)
-        return np.linspace(0.0, duration, steps + 1), np.array(temperatures)
-
-    def warmed(
-        self, trajectory: AbstractTrajectory, *, duration: float
-    ) -> "VirtualRobot":
-        """Return the same robot after a motion has been repeated for some time.
-
-        Args:
-            trajectory: Repeated motion.
-            duration: Duration [s]; the paper's robot is warm after 1800 s.
-        """
-        _, temperatures = self.warming(trajectory, duration=duration)
-        return self.replace(temperature=temperatures[-1])
-
     def resistance(self, q: Joints, qd: Joints) -> Joints:
         """Return friction less ripple of one sample, at constant speeds [N m or N]."""
         friction = self.present_friction.steady(qd)
@@ -385,8 +331,8 @@ class VirtualRobot(Hashable):
     ) -> Tracking:
         """Follow a trajectory by a servo and record what the sensors measure.
 
-        The robot starts in the desired motion. Gears keep their temperature, since
-        seconds do not warm them: use `warmed` for that.
+        The robot starts in the desired motion. Gears keep their temperature: `at` gives
+        them another one.
 
         Args:
             trajectory: Desired motion.
@@ -452,12 +398,6 @@ class VirtualRobot(Hashable):
             log,
             saturated_fractions,
         )
-
-
-def mean_power(friction: AbstractGearFriction, motion: Motion) -> Joints:
-    """Return the mean power of friction in a motion [W]."""
-    forces = in_numpy(friction, friction.steady, motion.qd)
-    return np.mean(forces * motion.qd, axis=0)
 
 
 def forward_forces(

@@ -6,7 +6,6 @@ import pytest
 from jaxid.dynamics.base import base_parameters
 from jaxid.identification.consistency.pseudo_inertia import pseudo_inertia
 from jaxid.simulation.tx90l import virtual_tx90l_on_rail
-from jaxid.trajectory.fourier import random_fourier_series
 
 COLD = {1: 273.40, 2: 1.68, 27: 248.41, 28: 41.26, 34: 312.50, 35: 18.24}
 WARM = {1: 273.62, 2: 1.65, 27: 90.19, 28: 25.65, 34: 233.00, 35: 15.07}
@@ -39,18 +38,6 @@ def test_temperature_leads_from_cold_to_warm_friction(base):
     )
 
 
-def test_half_an_hour_of_motion_warms_it_up(base):
-    cold = virtual_tx90l_on_rail()
-    motion = random_fourier_series(cold.robot, omega=0.8, reach=0.95, seed=2)
-    times, temperatures = cold.warming(motion, duration=1800.0)
-    assert (np.diff(temperatures, axis=0) > 0).all()
-    assert times[-1] == 1800.0
-    assert 40.0 < np.median(temperatures[-1]) < 50.0
-    warmed = base.from_standard(cold.warmed(motion, duration=1800.0).parameters)
-    assert warmed[26] == pytest.approx(WARM[27], rel=0.15)
-
-
-@pytest.mark.parametrize("warm", [False, True])
 def test_bodies_could_exist(warm):
     bodies = np.zeros((7, 10))
     bodies[:, :7] = virtual_tx90l_on_rail(warm=warm).values[:49].reshape(7, 7)
