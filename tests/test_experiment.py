@@ -449,7 +449,8 @@ def test_the_file_states_scales_of_each_joint(tmp_path):
     path.write_text(COLUMNS + keys, encoding="utf-8")
     columns = load_experiment(path).columns
     values = np.array([[-100.0, 100.0]])
-    angles, _, forces = columns.to_si(values, None, values)
+    found = columns.to_si({"angles": values, "forces": values})
+    angles, forces = found["angles"], found["forces"]
     np.testing.assert_allclose(angles, [[-0.9, 1.3]])
     np.testing.assert_allclose(forces, [[-80.0, 20.0]])
 
@@ -485,7 +486,8 @@ def test_calibration_files_of_lerobot_scale_each_joint(tmp_path, names):
         motor_names = [*SO_ARM]
     pairs = [lerobot_values(counts, SO_ARM[n], n == "gripper") for n in motor_names]
     values, angles = np.transpose(pairs, (1, 2, 0))
-    scaled_angles, velocities, _ = columns.to_si(values, values, values)
+    found = columns.to_si({"angles": values, "velocities": values})
+    scaled_angles, velocities = found["angles"], found["velocities"]
     np.testing.assert_allclose(scaled_angles, angles + 0.3, atol=1e-12)
     np.testing.assert_allclose(np.diff(velocities, axis=0), np.diff(angles, axis=0))
 
@@ -509,7 +511,7 @@ def test_an_experiment_names_a_calibration_file_of_lerobot(tmp_path):
         if expected is None:
             columns = load_experiment(path).columns
             values = np.full((1, 2), 100.0)
-            angles, _, _ = columns.to_si(values, None, values)
+            angles = columns.to_si({"angles": values})["angles"]
             half_ranges = np.pi / 4096 * np.array([2476, 2400])
             np.testing.assert_allclose(angles[0], half_ranges)
         else:

@@ -163,7 +163,7 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
         columns,
         load,
         sensor,
-        _build_rollout(tables.get("rollout", {}), reading),
+        _build_rollout(tables.get("rollout", {}), columns),
         call(CalibrationSettings, tables.get("calibration", {}), "calibration"),
         _build_excitation(tables.get("excitation", {}), path.parent),
         _build_collision(tables.get("collision", {}), path.parent),
@@ -171,7 +171,7 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
 
 
 def _build_rollout(
-    table: TomlTable, reading: LogReading
+    table: TomlTable, columns: Columns | None
 ) -> ServoSettings | TorqueSettings:
     """Return the settings for logs of commands if the file names them, or of torques.
 
@@ -182,7 +182,7 @@ def _build_rollout(
     settings = TorqueSettings(**torque)
     other_settings = ServoSettings(**servo)
     kind = "commands"
-    if reading.commands is not None:
+    if columns is not None and columns.commands is not None:
         settings = ServoSettings(**servo)
         other_settings = TorqueSettings(**torque)
         kind = "forces` without `recording.commands"

@@ -22,7 +22,11 @@ from jaxid.identification.estimators_by_name import ESTIMATORS
 from jaxid.identification.filter_selection import USUAL_CUTOFFS
 from jaxid.identification.uncertainty import UNCERTAINTIES, AbstractUncertainty
 from jaxid.measurement import filters
-from jaxid.measurement.columns import Columns, with_lerobot_calibration
+from jaxid.measurement.columns import (
+    JOINT_CHANNELS,
+    Columns,
+    with_lerobot_calibration,
+)
 from jaxid.measurement.log_columns import Selection
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
@@ -229,15 +233,10 @@ def build_columns(
     With the columns of a `wrench`, forces of the joints may be missing.
     """
     table = {key: with_joint_names(value, robot) for key, value in table.items()}
-    if "commands" in table:
-        # A robot that logs no torque.
-        table.setdefault("forces", table["commands"])
     arguments, sides, reading = decode(
         [Columns, Sides, LogReading], table, "recording", skip=SIDES
     )
     if "forces" not in arguments:
-        if wrench is None:
-            raise InputError("`recording.forces` is missing: `[recording]` needs it.")
         arguments["wrench"] = wrench
     with within("recording"):
         if "lerobot_calibration" in reading:
@@ -247,7 +246,8 @@ def build_columns(
             **arguments, **Sides(**sides).of_columns, joint_names=robot.joint_names
         )
         zeros = np.zeros((1, robot.joints))
-        columns.to_si(zeros, zeros, zeros)  # refuses lists that do not fit the robot
+        # Refuses lists that do not fit the robot.
+        columns.to_si(dict.fromkeys(JOINT_CHANNELS, zeros))
         require_fitting_units(columns, robot, arguments)
         return columns, LogReading(**reading)
 

@@ -16,6 +16,7 @@ from jaxid.units import NM, PERCENT, RAD, RAD_PER_S, Quantity, S, Unit
 
 from .log_files import Complaints, LogTable, Selection, open_log_file
 from .recording import positive_time
+from .time_series import NamedChannels
 
 Units = Unit | float | tuple[Unit | float, ...]
 """One unit for all joints, or one for each; a number is the size of one in SI units."""
@@ -37,12 +38,10 @@ COUNTER_SIZE = 2**16
 """Number after which counters of drives begin again."""
 MIN_OVERFLOW = 0.75
 """Smallest step of a counter that begins again, relative to its size."""
-BASE_CHANNELS = ("gyro", "accelerometer", "contact")
-"""Channels of a floating base."""
-Channels = tuple[Matrix, Matrix | None, Matrix | None]
-"""Angles, velocities and forces (samples x joints); None where there are none."""
-NOT_OF_JOINTS = ("time", "wrench", *BASE_CHANNELS)
-"""Channels that do not have one column for each joint."""
+JOINT_CHANNELS = ("angles", "forces", "velocities", "commands")
+"""Channels that have one column for each joint."""
+OTHER_CHANNELS = ("wrench", "gyro", "accelerometer", "contact")
+"""Channels of a force sensor and of a floating base."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -67,6 +66,8 @@ class Columns:
         forces: Joint forces, motor torques or motor currents.
         velocities: Measured velocities, on the same side as the angles, like `"dq{}"`;
             None if there are none.
+        commands: Commanded angles, like `"cmd{}"`, in units and signs of the angles;
+            with them `forces` may be None, for `jaxid rollout`.
         gyro: Angular velocity of a floating base, like `"gyro{}"`: x, y, z in the frame
             of its IMU.
         accelerometer: Acceleration that its IMU measures, gravity included, like
@@ -112,6 +113,7 @@ class Columns:
     angles: Selection
     forces: Selection | None = None
     velocities: Selection | None = None
+    commands: Selection | None = None
     gyro: Selection | None = None
     accelerometer: Selection | None = None
     contact: Selection | None = None
@@ -149,7 +151,8 @@ class Columns:
             )
         if self.sample_time is not None:
             positive_time(self.sample_time)
-        if self.forces is None and self.wrench is None:
+        measured = (self.forces, self.wrench, self.commands)
+        if measured.count(None) == len(measured):
             raise InputError(
                 "`forces` is missing: it names the columns of the forces of the joints."
             )
@@ -188,12 +191,6 @@ class Columns:
         return Quantity.SHARE in [unit.quantity for unit in _units(getattr(self, name))]
 
     @property
-    def base_factors(self) -> dict[str, float]:
-        """Sizes of the units of the channels of a floating base."""
-        factors = (self.gyro_unit.factor, self.accelerometer_unit, 1.0)
-        return dict(zip(BASE_CHANNELS, factors, strict=True))
-
-    @property
     def angle_symbol(self) -> str:
         """Unit of the angles of joints that turn; several symbols if they differ."""
         symbols = dict.fromkeys(unit.symbol for unit in _units(self.angle_unit))
@@ -223,11 +220,9 @@ class Columns:
                 f"`{name}` must be {words} for each joint, but is {numbers}."
             )
 
-    def to_si(
-        self, angles: Matrix, velocities: Matrix | None, forces: Matrix | None
-    ) -> Channels:
-        """Convert the numbers of a log to SI units (samples x joints)."""
-        joints = angles.shape[1]
+    def to_si(self, channels: NamedChannels) -> NamedChannels:
+        """Convert the numbers of a log to SI units, by channel (samples x columns)."""
+        joints = channels["angles"].shape[1]
 
         def numbers(name: str, default: float = 1.0) -> Vector:
             """Return an attribute's numbers of all joints; units become factors."""
@@ -244,15 +239,23 @@ class Columns:
         if self.velocity_unit is not None:
             velocity_unit = numbers("velocity_unit")
             velocity_scale = signs * velocity_unit * numbers("rated_velocities")
-        if velocities is not None:
-            velocities = velocities * velocity_scale
         # A log of currents has torque constants, which are one otherwise.
         gains = numbers("force_unit") * numbers("force_signs") * numbers("force_gains")
-        force_scale = gains * numbers("torque_constants") * numbers("rated_forces")
+        scales = {
+            "angles": angle_scale,
+            "commands": angle_scale,
+            "velocities": velocity_scale,
+            "forces": gains * numbers("torque_constants") * numbers("rated_forces"),
+            "wrench": self.wrench_sign,
+            "gyro": self.gyro_unit.factor,
+            "accelerometer": self.accelerometer_unit,
+            "contact": 1.0,
+        }
+        si = {name: values * scales[name] for name, values in channels.items()}
         offsets = numbers("angle_offsets", 0.0)
-        if forces is not None:
-            forces = forces * force_scale
-        return angles * angle_scale + offsets, velocities, forces
+        for name in {"angles", "commands"} & si.keys():
+            si[name] = si[name] + offsets
+        return si
 
 
 def with_lerobot_calibration(
@@ -334,55 +337,36 @@ class Log:
     columns: Columns
     notes: list[str] = dataclasses.field(default_factory=list)
 
-    def read(self, start: int = 0, stop: int | None = None) -> Channels:
-        """Return angles, velocities and forces of some rows, as they were recorded."""
-        arrays: dict[str, Matrix] = {}
-        for table in self.tables:
-            channels = [x for x in table.channels if x not in NOT_OF_JOINTS]
-            for channel, array in _numbers(table, channels, start, stop).items():
-                # A part does not tell how often a counter began again before.
-                is_part = start > 0 or stop is not None
-                arrays[channel] = (
-                    array if is_part else self._without_overflows(channel, array)
-                )
-        joints = arrays["angles"].shape[1]
-        for channel, array in arrays.items():
-            if array.shape[1] != joints:
-                raise InputError(
-                    f"`{channel}` have {array.shape[1]} columns, but the angles in "
-                    f"`{self.tables[0].source}` have {joints}: name one for each "
-                    "joint."
-                )
-        return self.columns.to_si(
-            arrays["angles"], arrays.get("velocities"), arrays.get("forces")
-        )
-
-    def wrench(self) -> Matrix:
-        """Return the wrench that a force sensor exerts on what is behind it [N, N m].
+    def read(self, start: int = 0, stop: int | None = None) -> NamedChannels:
+        """Return some rows of all channels but the time, as they were recorded.
 
         Raises:
-            InputError: If there are not three forces and three moments.
+            InputError: If a channel has a wrong number of columns.
         """
-        table = self.tables[0]
-        values = _numbers(table, ["wrench"], 0, None)["wrench"]
-        if values.shape[1] != 6:
-            raise InputError(
-                f"`wrench` has {values.shape[1]} columns in `{table.source}`, but must "
-                "name three forces, then three moments."
-            )
-        return self.columns.wrench_sign * values
-
-    def base_signals(self) -> dict[str, Matrix]:
-        """Return the channels of a floating base in SI units; none without columns."""
-        signals = {}
+        arrays: NamedChannels = {}
         for table in self.tables:
-            channels = [x for x in table.channels if x in BASE_CHANNELS]
-            part = table.read(channels)
-            for channel, names in part.channels.items():
-                blocks = [part.numbers(name) for name in names]
-                factor = self.columns.base_factors[channel]
-                signals[channel] = factor * np.concatenate(blocks, axis=1)
-        return signals
+            channels = [x for x in table.channels if x != "time"]
+            for channel, array in _numbers(table, channels, start, stop).items():
+                arrays[channel] = array
+                # A part does not tell how often a counter began again before.
+                is_whole = start == 0 and stop is None
+                if is_whole and channel in JOINT_CHANNELS:
+                    arrays[channel] = self._without_overflows(channel, array)
+        joints = arrays["angles"].shape[1]
+        source = self.tables[0].source
+        for channel, array in arrays.items():
+            columns = array.shape[1]
+            if channel in JOINT_CHANNELS and columns != joints:
+                raise InputError(
+                    f"`{channel}` have {columns} columns, but the angles in `{source}` "
+                    f"have {joints}: name one for each joint."
+                )
+            if channel == "wrench" and columns != 6:
+                raise InputError(
+                    f"`wrench` has {columns} columns in `{source}`, but must name "
+                    "three forces, then three moments."
+                )
+        return self.columns.to_si(arrays)
 
     def _without_overflows(self, channel: str, array: Matrix) -> Matrix:
         """Return a channel whose counter goes on where it began again; note it."""
@@ -466,24 +450,15 @@ def open_log(
         raise InputError(
             "`velocities_path` is given, but `Columns.velocities` names no columns."
         )
-    channels: dict[str, tuple[FilePath, Selection | None]] = {
-        "angles": (path, columns.angles),
-    }
-    if columns.forces is not None:
-        channels["forces"] = (forces_path or path, columns.forces)
-    if columns.wrench is not None:
-        channels["wrench"] = (path, columns.wrench)
-    if columns.velocities is not None:
-        channels["velocities"] = (velocities_path or path, columns.velocities)
-    for channel in BASE_CHANNELS:
-        if getattr(columns, channel) is not None:
-            channels[channel] = (path, getattr(columns, channel))
-    if columns.time is not None or columns.sample_time is None:
-        channels["time"] = (path, columns.time)
-
+    paths = {"forces": forces_path, "velocities": velocities_path}
     selections: dict[Path, dict[str, Selection | None]] = {}
-    for channel, (file_path, selection) in channels.items():
-        selections.setdefault(Path(file_path), {})[channel] = selection
+    for channel in (*JOINT_CHANNELS, *OTHER_CHANNELS):
+        selection = getattr(columns, channel)
+        if selection is not None:
+            file_path = Path(paths.get(channel) or path)
+            selections.setdefault(file_path, {})[channel] = selection
+    if columns.time is not None or columns.sample_time is None:
+        selections[Path(path)]["time"] = columns.time
     tables = []
     for file_path, file_selections in selections.items():
         file = open_log_file(file_path, file_selections, columns.joint_names)

@@ -372,6 +372,10 @@ def observe(
             recording = dataclasses.replace(recording, velocities=None)
 
     refuse_missing_wrench(recording, robot)
+    if recording.forces is None and recording.wrench is None:
+        raise InputError(
+            f"`{recording.name}` has no forces: name their columns (`forces`)."
+        )
     measured_forces = recording.forces
     if measured_forces is None:
         measured_forces = np.zeros(recording.angles.shape)

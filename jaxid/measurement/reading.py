@@ -14,14 +14,20 @@ from jaxid.io import FilePath
 from jaxid.result_table import printable
 from jaxid.robot.robot import Robot
 
-from .columns import Channels, Columns, Log, open_log
+from .columns import Columns, Log, open_log
 from .filters import AbstractDecimation, AbstractFilter
 from .log_files import COMMENT, NO_NUMBER, Complaints, LogTable
 from .observations import Observations, Progress, prepare
 from .recording import MIN_SAMPLES, Recording, consecutive
 from .samples import AbstractSamples, joined, joint_side
 from .time_grid import NeedsMemory, Range, Ranges, TimeGrid, find_grid
-from .time_series import hold_notes, is_sparse, join_channels, without_filling
+from .time_series import (
+    NamedChannels,
+    hold_notes,
+    is_sparse,
+    join_channels,
+    without_filling,
+)
 from .time_stamps import MAX_LATE_ROWS
 
 PART_SIZE = 65536
@@ -75,20 +81,12 @@ def read_recording(
             names file, column and line.
     """
     log = open_log(path, columns, forces_path, velocities_path, is_lenient=True)
-    angles, velocities, forces = log.read()
+    channels = log.read()
     sample_time = columns.sample_time
     stamps = log.stamps() if sample_time is None else None
     complaints = log.bad_rows
     notes = [*log.notes, *(note for table in log.tables for note in table.notes)]
-    measured_channels = {
-        "angles": angles,
-        "forces": forces,
-        "velocities": velocities,
-        "wrench": None if columns.wrench is None else log.wrench(),
-        **log.base_signals(),
-    }
-    channels = {name: x for name, x in measured_channels.items() if x is not None}
-    is_row = np.ones(len(angles), bool)
+    is_row = np.ones(len(channels["angles"]), bool)
     is_row[[row for row, text in complaints.items() if COMMENT in text]] = False
     if not is_row.all():
         rows_before = np.cumsum(is_row) - 1
@@ -133,7 +131,8 @@ def read_recording(
             sample_time = None
     channels = {name: values[good_rows] for name, values in channels.items()}
     if columns.unwrap:
-        channels["angles"] = np.unwrap(channels["angles"], axis=0)
+        for name in {"angles", "commands"} & channels.keys():
+            channels[name] = np.unwrap(channels[name], axis=0)
     measured: dict[str, Any] = {"forces": None, **channels}
     recording = Recording.of(
         **measured,
@@ -272,8 +271,14 @@ class SamplesOnDisk(AbstractSamples):
         # With the neighbours that the filter needs.
         start = max(a, samples.start - self.overlap)
         stop = min(b, samples.stop + self.overlap)
-        channels: Any = self.read_rows(slice(start, stop))
-        q, qd, forces = joint_side(self.robot, self.log.columns, *channels)
+        channels = self.read_rows(slice(start, stop))
+        q, qd, forces = joint_side(
+            self.robot,
+            self.log.columns,
+            channels["angles"],
+            channels.get("velocities"),
+            channels["forces"],
+        )
         motion = self.filter.motion(q, qd, self.sample_time)
 
         first_row = samples.start - start
@@ -284,8 +289,8 @@ class SamplesOnDisk(AbstractSamples):
     def read_all(self):  # noqa: D102
         return joined(self.read(slice(a, b)) for a, b in self.segments)
 
-    def read_rows(self, samples: slice) -> Channels:
-        """Return angles, velocities and forces of a segment's samples as recorded."""
+    def read_rows(self, samples: slice) -> NamedChannels:
+        """Return the channels of a segment's samples as recorded."""
         k = self._segment(samples)
         shift = self.first_rows[k] - self.segments[k][0]
         return self.log.read(samples.start + shift, samples.stop + shift)
@@ -379,7 +384,7 @@ def scan_log(
             sample_time=grid.sample_time,
         )
 
-    first_angles, _, _ = log.read(0, 1)
+    first_angles = log.read(0, 1)["angles"]
     return prepare(
         load,
         grid,
@@ -418,13 +423,13 @@ def read_excerpt(log: Observations, max_samples: int, share: float = 1.0) -> Rec
             if b - a >= MIN_SAMPLES:
                 parts.append(source.read_rows(slice(a, b)))
                 times.append(time + dt * (np.arange(a, b) - begin))
-    angles, velocities, forces = zip(*parts, strict=True)
+    channels = {x: np.concatenate([part[x] for part in parts]) for x in parts[0]}
     columns = source.log.columns
     return Recording(
         time=np.concatenate(times),
-        angles=np.concatenate(angles),
-        forces=np.concatenate(forces),
-        velocities=None if velocities[0] is None else np.concatenate(velocities),
+        angles=channels["angles"],
+        forces=channels["forces"],
+        velocities=channels.get("velocities"),
         angles_on_motor_side=columns.angles_on_motor_side,
         forces_on_motor_side=columns.forces_on_motor_side,
         segments=consecutive(map(len, times)),

@@ -71,6 +71,8 @@ class Recording(eqx.Module):
         wrench: Force and moment that each force sensor exerts on what is behind it [N,
             N m]; None if there are none.
         base: Signals of a floating base; None if there are none.
+        commands: Commanded angles, on the angles' side [rad or m]; None if there are
+            none.
     """
 
     time: Float[AnyArray, " samples"]
@@ -87,6 +89,7 @@ class Recording(eqx.Module):
     angle_unit: str = eqx.field(static=True, default="rad")
     wrench: Float[AnyArray, "samples wrenches"] | None = None
     base: BaseSignals | None = None
+    commands: JointSamples | None = None
 
     @classmethod
     def of(
@@ -95,6 +98,7 @@ class Recording(eqx.Module):
         forces: ArrayLike | None,
         *,
         velocities: ArrayLike | None = None,
+        commands: ArrayLike | None = None,
         wrench: ArrayLike | None = None,
         gyro: ArrayLike | None = None,
         accelerometer: ArrayLike | None = None,
@@ -119,6 +123,7 @@ class Recording(eqx.Module):
             forces: Forces of joints or motors [N m or N]; None if only wrenches are
                 measured.
             velocities: Measured velocities [rad/s or m/s].
+            commands: Commanded angles [rad or m].
             wrench: Force and moment that each force sensor exerts on what is behind it:
                 three forces [N], three moments [N m].
             gyro: Angular velocity of a floating base, in the frame of its IMU [rad/s].
@@ -142,15 +147,23 @@ class Recording(eqx.Module):
             raise InputError(
                 f"`largest_gap` must be above 1 sample time, but is {largest_gap:g}."
             )
-        channels = {"angles": angles, "forces": forces, "velocities": velocities}
+        channels = {
+            "angles": angles,
+            "forces": forces,
+            "velocities": velocities,
+            "commands": commands,
+        }
         shape = np.shape(angles)
         data: dict[str, Any] = {
             key: None if x is None else finite_channel(name, key, x, shape, first_row)
             for key, x in channels.items()
         }
         samples = len(data["angles"])
-        if wrench is None and forces is None:
-            raise InputError(f"`{name}` needs `forces` or a `wrench`, but has neither.")
+        if wrench is None and forces is None and commands is None:
+            raise InputError(
+                f"`{name}` needs `forces`, a `wrench` or `commands`, but has none of "
+                "them."
+            )
         if wrench is not None:
             size = (samples, np.shape(wrench)[-1])
             data["wrench"] = finite_channel(name, "wrench", wrench, size, first_row)
@@ -170,10 +183,11 @@ class Recording(eqx.Module):
             refuse_shared_stamps(stamps, data["angles"], name)
             resample = resampling(stamps, name, (largest_gap, bridged), first_row)
             grid = resample.grid
-            q = data["angles"]
+            rows = data
             data = {key: None if x is None else resample(x) for key, x in data.items()}
-            if not grid.is_exact:
-                data["angles"] = interpolate_turns(resample, q)
+            for key in ("angles", "commands"):
+                if not grid.is_exact and rows[key] is not None:
+                    data[key] = interpolate_turns(resample, rows[key])
             times = resample.times
             deviation = grid.deviation / grid.sample_time
         else:
@@ -397,14 +411,16 @@ def _without_delay(segment: Recording, seconds: float, lost_samples: int) -> dic
     time = np.asarray(segment.time)
 
     def shift(values):
+        if values is None:
+            return None
         return scipy.interpolate.CubicSpline(time, values)(time[samples] - seconds)
 
-    qd = segment.velocities
     return {
         "time": time[samples],
         "angles": shift(segment.angles),
         "forces": _part(segment.forces, samples),
-        "velocities": None if qd is None else shift(qd),
+        "velocities": shift(segment.velocities),
+        "commands": shift(segment.commands),
         "wrench": _part(segment.wrench, samples),
     }
 

@@ -56,8 +56,8 @@ def without_filling(channels: NamedChannels) -> NamedChannels:
         name: np.append(True, np.diff(values, axis=0).any(axis=1))
         for name, values in channels.items()
     }
-    measured_name = "forces" if "forces" in changes else "wrench"
-    rows = np.stack([changes["angles"], changes[measured_name]])
+    measured_names = [x for x in ("forces", "wrench", "commands") if x in changes]
+    rows = np.stack([changes["angles"], changes[measured_names[0]]])
     smaller_count = rows.sum(axis=1).min()
     is_filled = (
         smaller_count >= MIN_CHANGES
@@ -98,7 +98,8 @@ def join_channels(
     notes = []
     for channel, values in channels.items():
         ordered_values = values[order]
-        joined[channel] = _at_rows(stamps, ordered_values, rows, channel == "angles")
+        are_angles = channel in ("angles", "commands")
+        joined[channel] = _at_rows(stamps, ordered_values, rows, are_angles)
         notes += _rate_notes(channel, stamps, ordered_values, rows)
     is_common = np.isfinite(np.hstack([*joined.values()])).all(axis=1)
     if not is_common.any():
@@ -155,7 +156,8 @@ def hold_notes(channels: NamedChannels, sample_time: float) -> list[str]:
     notes = []
     for channel, values in channels.items():
         changes = np.flatnonzero(np.diff(values, axis=0).any(axis=1))
-        if channel == "angles" or len(changes) < MIN_CHANGES:
+        # Servos hold their commands, which is no fault of the log.
+        if channel in ("angles", "commands") or len(changes) < MIN_CHANGES:
             continue
         lengths = np.diff(changes)
         length = float(np.mean(lengths))

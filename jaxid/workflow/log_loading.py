@@ -96,49 +96,22 @@ def read_commands(setup: Setup, log: Path, columns: Columns) -> Recording:
     Raises:
         InputError: If the columns of the commands are not named, or not in the log.
     """
-    commands = setup.reading.commands
-    if commands is None:
+    if columns.commands is None:
         raise InputError(
             "`recording.commands` is missing: it names the columns of the "
             'commanded angles, like "cmd{}".'
         )
-    # Readers know no commands: they read them as forces, with their units ...
-    measured_columns = dataclasses.replace(
+    # A robot without torques may have no columns of them.
+    columns = dataclasses.replace(
         columns,
-        forces=commands,
+        forces=None,
         force_unit=NM,
-        force_signs=None,
-        force_gains=None,
         torque_constants=None,
         rated_forces=None,
         velocities=None,
     )
-    # ... and once more as angles, in the units and signs of these.
-    command_columns = dataclasses.replace(
-        measured_columns, angles=commands, forces=columns.angles
-    )
-    try:
-        recording = read_log(setup, log, measured_columns)
-    except InputError as error:
-        text = str(error).replace("`forces`", "`commands`")
-        raise InputError(text) from None
-    command_angles = read_log(setup, log, command_columns).angles
-    # Servos hold their commands, which is no fault of the log.
-    notes = tuple(note for note in recording.notes if "`force_delay" not in note)
-    return dataclasses.replace(recording, forces=command_angles, notes=notes)
-
-
-def commanded_log(setup: Setup, log: Path, columns: Columns) -> Recording | None:
-    """Return a log with the commanded angles in place of the measured ones.
-
-    None if their columns are not named, or the log is long.
-    """
-    if setup.reading.commands is None or is_long(log):
-        return None
-    command_columns = dataclasses.replace(
-        columns, angles=setup.reading.commands, velocities=None
-    )
-    return read_log(setup, log, command_columns)
+    recording = read_log(setup, log, columns)
+    return dataclasses.replace(recording, forces=recording.commands)
 
 
 def is_long(log: Path) -> bool:
@@ -203,11 +176,13 @@ def load_log(
         checked = check_contacts(setup.base, recording, setup.filter)
         recording, contact_findings = checked
     observations = setup.observe(recording)
+    commanded_motion = None
+    if recording.commands is not None:
+        commanded_motion = dataclasses.replace(
+            recording, angles=recording.commands, velocities=None
+        )
     diagnosis = diagnose(
-        recording,
-        setup.robot,
-        observations=observations,
-        commands=commanded_log(setup, path, columns),
+        recording, setup.robot, observations=observations, commands=commanded_motion
     )
     findings = (*diagnosis.findings, *contact_findings)
     diagnosis = dataclasses.replace(diagnosis, findings=findings)

@@ -77,8 +77,7 @@ def identify_rollout_from_logs(
     """Identify a robot so that simulations follow its positions, and simulate.
 
     Args:
-        setup: How logs become parameters; `reading.commands` names the columns of the
-            commands.
+        setup: How logs become parameters.
         logs: Paths of logs.
         columns: Meaning of their columns.
         settings: Settings for logs of commands, or for logs of torques.

@@ -47,7 +47,6 @@ from jaxid.measurement.filters import (
     AbstractFilter,
     Subsample,
 )
-from jaxid.measurement.log_files import Selection
 from jaxid.measurement.observations import Observations, observe
 from jaxid.measurement.reading import MAX_BAD_ROWS
 from jaxid.measurement.recording import Recording
@@ -100,8 +99,6 @@ class LogReading:
             the log, like `"{}_torque.csv"`: "{}" is replaced by the log's name without
             its suffix.
         velocities_file: File of the velocities, likewise, like `"{}_speed.csv"`.
-        commands: Columns of the commanded angles, like `"cmd{}"`: with them `jaxid
-            rollout` needs no `forces`.
         lerobot_calibration: Calibration file of LeRobot for `angle_unit = "%"`, like
             `"my_arm.json"`: angles count from the middle of each calibrated range.
         force_delay: Time by which the forces in the log are late, compared with the
@@ -116,7 +113,6 @@ class LogReading:
 
     forces_file: str | None = None
     velocities_file: str | None = None
-    commands: Selection | None = None
     lerobot_calibration: str | None = None
     force_delay: float = 0.0
     largest_gap: float = 1.75

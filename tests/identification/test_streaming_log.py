@@ -136,7 +136,8 @@ def test_text_of_any_kind(base, numbers, tmp_path, separator, header, end, point
     log = scan_log(path, columns, base.model.robot, SMOOTH)
     assert log.samples == 3000
     whole = jid.read_recording(path, columns)
-    angles, _, forces = log.source.read_rows(slice(0, 3000))
+    rows = log.source.read_rows(slice(0, 3000))
+    angles, forces = rows["angles"], rows["forces"]
     np.testing.assert_array_equal(angles, whole.angles)
     np.testing.assert_array_equal(forces, whole.forces)
 

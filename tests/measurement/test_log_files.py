@@ -489,7 +489,8 @@ def test_units_that_only_one_drive_has(name):
     change, angle_scale, offsets, force_scale = SCALES[name]
     columns = Columns(angles="q{}", forces="tau{}", time="t", **change)
     values = np.array([[3.0, -50.0], [100.0, 7.0]])
-    angles, velocities, forces = columns.to_si(values, values, values)
+    channels = dict.fromkeys(("angles", "velocities", "forces"), values)
+    angles, velocities, forces = columns.to_si(channels).values()
     np.testing.assert_allclose(angles, values * angle_scale + offsets, rtol=1e-14)
     np.testing.assert_allclose(velocities, values * angle_scale, rtol=1e-14)
     np.testing.assert_allclose(forces, values * force_scale, rtol=1e-14)
@@ -500,7 +501,8 @@ def test_velocities_in_percent_and_angles_in_counts():
     rates = {"rated_velocities": (3.0, 2.0), "angle_signs": (1, -1)}
     columns = Columns("q{}", "tau{}", time="t", **scales, **rates)
     values = np.array([[50.0, 100.0]])
-    angles, velocities, _ = columns.to_si(values, values, values)
+    channels = dict.fromkeys(("angles", "velocities"), values)
+    angles, velocities = columns.to_si(channels).values()
     np.testing.assert_allclose(angles, [[25.0, -50.0]])
     np.testing.assert_allclose(velocities, [[1.5, -2.0]])
 
