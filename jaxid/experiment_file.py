@@ -163,12 +163,11 @@ KEYS: dict[str, TomlTable] = {
         "stop": float,
     },
     "filter": {
-        "kind": Literal["butterworth", "savitzky_golay", "paper", "periodic"],
+        "kind": Literal["butterworth", "paper", "periodic"],
         "cutoff": float | list[float],
         "order": int,
         "force_cutoff": float,
         "margin": float,
-        "window": float,
         "velocity": float,
         "acceleration": float,
         "period": float,

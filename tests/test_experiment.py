@@ -243,8 +243,6 @@ def test_filters_and_rows(load):
     text = "cutoff = 20\norder = 2\nforce_cutoff = inf\nmargin = 0.1"
     found = load(f'{ARM}[filter]\nkind = "butterworth"\n{text}').setup.filter
     assert found == jid.ZeroPhaseButterworth(20.0, 2, np.inf, 0.1)
-    found = load(f'{ARM}[filter]\nkind = "savitzky_golay"\nwindow = 0.2').setup.filter
-    assert found == jid.filters.SavitzkyGolay(0.2)
     found = load(f'{ARM}[filter]\nkind = "paper"\nvelocity = 900').setup.filter
     assert found == jid.filters.PaperFilter(900.0, 100.0)
     assert load(ARM + "[rows]\nstep = 50\n").setup.decimation == jid.Subsample(50)

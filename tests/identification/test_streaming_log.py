@@ -15,7 +15,7 @@ COLUMNS = jid.Columns(angles="q{}", forces="tau{}", time="t")
 SAMPLES = 20000
 DT = 1e-3
 SMOOTH = jid.ZeroPhaseButterworth(30.0, margin=0.3)
-FILTERS = [SMOOTH, jid.filters.SavitzkyGolay(0.06)]
+FILTERS = [SMOOTH, jid.ZeroPhaseButterworth(30.0, order=2)]
 EVERY = jid.Subsample(15)
 
 

@@ -14,7 +14,6 @@ from jaxid.measurement.filters import (
     Decimation,
     PaperFilter,
     PeriodicFourier,
-    SavitzkyGolay,
     Subsample,
     ZeroPhaseButterworth,
 )
@@ -29,8 +28,6 @@ FILTERS = [
     ZeroPhaseButterworth(30, order=3, force_cutoff=np.inf),
     PaperFilter(),
     PeriodicFourier(PERIOD, 5),
-    SavitzkyGolay(0.04),
-    SavitzkyGolay(0.1, order=4),
 ]
 every = pytest.mark.parametrize("filter", FILTERS, ids=lambda f: type(f).__name__)
 
@@ -199,24 +196,6 @@ def test_butterworth_derivatives_are_of_fourth_order():
     )
 
 
-def test_savitzky_golay_is_scipys_and_exact_for_polynomials():
-    t = DT * np.arange(400)
-    x = np.random.default_rng(0).normal(size=(400, 2))
-    cubic = np.stack([t**3 - t, 2.0 * t**2], axis=1)
-    filter, inner = SavitzkyGolay(0.05), slice(25, -25)
-    for values in (x, cubic):
-        motion = filter.motion(values, None, DT)
-        for k, found in enumerate((motion.q, motion.qd, motion.qdd)):
-            expected = signal.savgol_filter(values, 51, 3, k, DT, axis=0)
-            bound = 1e-12 * DT**-k
-            np.testing.assert_allclose(found[inner], expected[inner], atol=bound)
-        np.testing.assert_allclose(filter.smooth(values, DT), motion.q, atol=1e-14)
-    exact = np.stack([6.0 * t, np.full(400, 4.0)], axis=1)
-    np.testing.assert_allclose(motion.qdd[inner], exact[inner], atol=1e-8)
-    measured = filter.motion(cubic, 2.0 * motion.qd, DT)
-    np.testing.assert_allclose(measured.qdd[50:-50], 2.0 * exact[50:-50], atol=1e-6)
-
-
 def test_the_cutoff_is_where_the_gain_is_one_half():
     for filter in FILTERS:
         low = filter.low_pass(DT)
@@ -279,10 +258,6 @@ def periodic(periods, harmonics):
         (lambda: PaperFilter(10.0, 400.0).edge(0.01), "`acceleration`"),
         (lambda: PeriodicFourier(np.inf, 5).edge(DT), "`10 harmonics / period`"),
         (lambda: PeriodicFourier(1.0, 2.5), "`harmonics`"),
-        (lambda: SavitzkyGolay(0.0), "`window` of `SavitzkyGolay`"),
-        (lambda: SavitzkyGolay(0.1, order=1), "`order`"),
-        (lambda: SavitzkyGolay(0.002).edge(DT), r"`window` of 0\.002 s has 3 samples"),
-        (lambda: SavitzkyGolay(np.inf).edge(DT), "`window`"),
         (lambda: Subsample(0), "`step`"),
         (lambda: Decimation((10, 20)), "`factors`"),
     ],

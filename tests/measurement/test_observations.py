@@ -9,7 +9,6 @@ from jaxid.measurement.filters import (
     Decimation,
     PaperFilter,
     PeriodicFourier,
-    SavitzkyGolay,
     Subsample,
     ZeroPhaseButterworth,
 )
@@ -55,7 +54,6 @@ CASES = [
     (ZeroPhaseButterworth(15.0), Decimation((7,))),
     (PaperFilter(), Decimation((5, 3))),
     (PeriodicFourier(2.0, 4), Subsample(10)),
-    (SavitzkyGolay(0.05), Decimation((10,))),
 ]
 every = pytest.mark.parametrize(("filter", "decimation"), CASES)
 

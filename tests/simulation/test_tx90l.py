@@ -38,6 +38,7 @@ def test_temperature_leads_from_cold_to_warm_friction(base):
     )
 
 
+@pytest.mark.parametrize("warm", [False, True])
 def test_bodies_could_exist(warm):
     bodies = np.zeros((7, 10))
     bodies[:, :7] = virtual_tx90l_on_rail(warm=warm).values[:49].reshape(7, 7)

@@ -8,23 +8,20 @@ from .decimation import (
 from .filter import AbstractFilter as AbstractFilter
 from .low_pass import (
     AbstractLowPass as AbstractLowPass,
-    Convolution as Convolution,
+    AllPass as AllPass,
     RecursiveLowPass as RecursiveLowPass,
-    weighted_mean as weighted_mean,
+    recursive as recursive,
 )
 from .motion_filters import (
     PaperFilter as PaperFilter,
     PeriodicFourier as PeriodicFourier,
-    SavitzkyGolay as SavitzkyGolay,
     ZeroPhaseButterworth as ZeroPhaseButterworth,
     first_difference as first_difference,
-    half_window as half_window,
     second_difference as second_difference,
 )
 
 FILTERS: dict[str, type[AbstractFilter]] = {
     "butterworth": ZeroPhaseButterworth,
-    "savitzky_golay": SavitzkyGolay,
     "paper": PaperFilter,
     "periodic": PeriodicFourier,
 }

@@ -13,7 +13,7 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 
 from .filter import integer
-from .low_pass import ALL_PASS, AbstractLowPass, float_array, recursive
+from .low_pass import AbstractLowPass, AllPass, float_array, recursive
 
 MAX_FACTOR = 13
 """Largest factor of a stage: the poles of its low-pass are still exact enough."""
@@ -83,7 +83,7 @@ class Subsample(AbstractDecimation):
         return (self.step,)
 
     def low_pass(self, stage):  # noqa: D102
-        return ALL_PASS
+        return AllPass()
 
     def check(self, cutoff, sample_time):  # noqa: D102
         rate = 1.0 / (sample_time * self.step)
@@ -129,6 +129,6 @@ class Decimation(AbstractDecimation):
     def low_pass(self, stage):  # noqa: D102
         factor = self.factors[stage]
         if factor == 1:
-            return ALL_PASS
+            return AllPass()
         sos = scipy.signal.cheby1(8, 0.05, 0.8 / factor, output="sos")
         return recursive(np.asarray(sos, np.float64), 0.4 / factor)

@@ -1,4 +1,4 @@
-"""Zero-phase low-passes: recursive ones, run forward and backward, and convolutions."""
+"""Zero-phase low-passes: recursive filters that run forward and backward."""
 
 import abc
 import math
@@ -6,11 +6,10 @@ from typing import Any
 
 import equinox as eqx
 import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Array, Float, Matrix, Vector, namespace
+from jaxid.arrays import AnyArray, Array, Float, Matrix, namespace
 from jaxid.errors import InputError
 
 SETTLING_TOLERANCE = 1e-4
@@ -49,70 +48,19 @@ class AbstractLowPass(eqx.Module):
         """
 
 
-class Convolution(AbstractLowPass):
-    """Weighted mean of the samples around each sample, with odd extensions at the ends.
+class AllPass(AbstractLowPass):
+    """Low-pass that changes nothing."""
 
-    Attributes:
-        kernel: Weights of the samples, from the earliest to the latest: an odd number.
-        cutoff: Frequency at which the gain falls below 1/2 [Hz]; infinite if everything
-            passes.
-    """
-
-    kernel: tuple[float, ...] = eqx.field(static=True)
-    cutoff: float = eqx.field(static=True)
+    cutoff: float = eqx.field(static=True, default=math.inf)
 
     def __call__(self, x):  # noqa: D102
-        x = float_array(x)
-        if len(self.kernel) == 1 or x.size == 0:
-            return x  # the gain for constants is one
-        return correlate(x, np.array(self.kernel))
+        return float_array(x)
 
     def gain(self, frequency, sample_time):  # noqa: D102
-        return kernel_gain(np.array(self.kernel), np.asarray(frequency), sample_time)
+        return np.ones(np.shape(frequency))
 
     def memory(self, tolerance=1e-14):  # noqa: D102
-        return len(self.kernel) // 2
-
-
-def correlate(x: Any, kernel: Vector) -> Any:
-    """Return sums of the samples around each sample, times an odd number of weights."""
-    half = len(kernel) // 2
-    extended_samples = odd_extension(x, half)
-    if not isinstance(x, jax.Array):
-        sums = scipy.ndimage.correlate1d(extended_samples, kernel, axis=0)
-        return sums[half : half + len(x)]
-
-    def correlate_column(column: Array) -> Array:
-        precision = jax.lax.Precision.HIGHEST
-        return jnp.correlate(column, kernel, mode="valid", precision=precision)
-
-    columns = extended_samples.reshape(len(extended_samples), -1)
-    return jax.vmap(correlate_column, 1, 1)(columns).reshape(x.shape)
-
-
-def kernel_gain(
-    kernel: Vector, frequency: np.ndarray, sample_time: float
-) -> np.ndarray:
-    """Return the size of the gain of a weighted mean for some frequencies [Hz]."""
-    angular_frequency = 2 * math.pi * frequency * sample_time
-    return np.abs(np.polyval(kernel, np.exp(1j * angular_frequency)))
-
-
-def weighted_mean(kernel: Vector, sample_time: float) -> Convolution:
-    """Return the filter of an odd number of weights with the sum one."""
-    # The gain at sixteen lines for each oscillation that fits into the kernel.
-    lines = 8 * len(kernel) + 1
-    frequency = np.linspace(0.0, 0.5 / sample_time, lines)
-    gain = kernel_gain(kernel, frequency, sample_time)
-    k = int(np.argmax(gain < 0.5))
-    cutoff = math.inf  # everything passes
-    if k > 0:
-        # The gain falls from line k - 1 to line k.
-        gains = gain[[k, k - 1]]
-        frequencies = frequency[[k, k - 1]]
-        cutoff = float(np.interp(0.5, gains, frequencies))
-    weights = tuple(kernel.tolist())
-    return Convolution(kernel=weights, cutoff=cutoff)
+        return 0
 
 
 class RecursiveLowPass(AbstractLowPass):
@@ -223,10 +171,6 @@ def float_array(x: Any) -> Any:
     return x if isinstance(x, jax.Array) else np.asarray(x, np.float64)
 
 
-ALL_PASS = Convolution(kernel=(1.0,), cutoff=math.inf)
-"""Low-pass that changes nothing."""
-
-
 def butterworth(
     cutoff: float, order: int, sample_time: float, name: str = "cutoff"
 ) -> AbstractLowPass:
@@ -235,7 +179,7 @@ def butterworth(
     `cutoff` [Hz] is scipy's.
     """
     if math.isinf(cutoff):
-        return ALL_PASS
+        return AllPass()
     require_cutoff(name, cutoff, sample_time)
     sos = scipy.signal.butter(order, cutoff, output="sos", fs=1.0 / sample_time)
     return recursive(np.asarray(sos, np.float64), cutoff)

@@ -6,7 +6,6 @@ from typing import ClassVar
 import equinox as eqx
 import numpy as np
 import scipy
-from numpy.polynomial import legendre
 
 from jaxid.arrays import AnyArray, Matrix, Vector, optional
 from jaxid.dynamics.motion import Motion
@@ -25,10 +24,8 @@ from .low_pass import (
     SETTLING_TOLERANCE,
     AbstractLowPass,
     butterworth,
-    correlate,
     recursive,
     require_cutoff,
-    weighted_mean,
 )
 
 MAX_SERIES_ERROR = 0.05
@@ -37,8 +34,6 @@ FORCE_BAND = 10
 """Cut-off of the forces of a periodic motion, over its highest harmonic."""
 FORCE_ORDER = 4
 """Order of that filter, of one direction."""
-MAX_WINDOW = 10**5
-"""Samples of the longest window."""
 
 
 class ZeroPhaseButterworth(AbstractFilter):
@@ -98,71 +93,6 @@ class ZeroPhaseButterworth(AbstractFilter):
             return round(self.margin / sample_time)
         motion = butterworth(self.cutoff, self.order, sample_time)
         return max(motion.memory(SETTLING_TOLERANCE), super().edge(sample_time))
-
-
-class SavitzkyGolay(AbstractFilter):
-    """Polynomials, fitted to the samples around each sample and differentiated there.
-
-    The positions, velocities and accelerations are the value and the derivatives of the
-    polynomial in the middle of its window. Forces and columns are smoothed by the same
-    polynomial. Measured velocities, if there are any, are filtered like the angles and
-    differentiated once. The filter has a finite impulse response: nothing outside the
-    window matters. Its gain falls more slowly than that of a Butterworth filter.
-
-    Attributes:
-        window: Duration of the window [s], like `0.1`.
-        order: Degree of the polynomial.
-    """
-
-    window: float = eqx.field(static=True, converter=float)
-    order: int = eqx.field(static=True, converter=integer("order"), default=3)
-
-    def __check_init__(self) -> None:
-        require_positive(self, "window")
-        require_order(self, min_order=2)  # a lower one has no second derivative
-
-    def motion(self, angles, velocities, sample_time):  # noqa: D102
-        # From the first sample on, so that a joint at rest stays exactly at rest.
-        path = angles - angles[0]
-        q = angles[0] + self._derivative(path, 0, sample_time)
-        if velocities is None:
-            qd = self._derivative(path, 1, sample_time)
-            qdd = self._derivative(path, 2, sample_time)
-            return Motion(q, qd, qdd)
-        change = velocities - velocities[0]
-        qd = velocities[0] + self._derivative(change, 0, sample_time)
-        return Motion(q, qd, self._derivative(change, 1, sample_time))
-
-    def low_pass(self, sample_time):  # noqa: D102
-        return weighted_mean(self._kernel(0, sample_time), sample_time)
-
-    def _derivative(self, x: AnyArray, times: int, sample_time: float) -> AnyArray:
-        return correlate(x, self._kernel(times, sample_time))
-
-    def _kernel(self, derivative: int, sample_time: float) -> Vector:
-        """Return the weights of the samples in a derivative of the polynomial."""
-        half = half_window(self.window, sample_time, self.order + 1)
-        # Legendre polynomials: powers, as in `scipy.signal.savgol_coeffs`, lose digits.
-        places = np.arange(-half, half + 1) / half
-        basis = legendre.legvander(places, self.order)
-        derivatives = legendre.legder(np.eye(self.order + 1), derivative)
-        centre_values = legendre.legval(0.0, derivatives)
-        unit = (half * sample_time) ** derivative
-        return centre_values @ np.linalg.pinv(basis) / unit
-
-
-def half_window(window: float, sample_time: float, min_samples: int = 3) -> int:
-    """Return the samples on each side of the one in the middle of a window [s]."""
-    steps = min(window / sample_time, MAX_WINDOW)
-    half = round(0.5 * steps)
-    samples = 2 * half + 1
-    if not min_samples <= samples < MAX_WINDOW:
-        raise InputError(
-            f"`window` of {window:.6g} s has {samples} samples or more at "
-            f"{1 / sample_time:.6g} Hz, but at least {min_samples} and less than "
-            f"{MAX_WINDOW} are needed: change it, or check `time_unit`."
-        )
-    return half
 
 
 class PaperFilter(AbstractFilter):
