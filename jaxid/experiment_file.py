@@ -153,7 +153,6 @@ KEYS: dict[str, TomlTable] = {
         "side": SIDE,
         "forces_side": SIDE,
         "forces_file": str,
-        "velocities_file": str,
         "commands": Column,
         "lerobot_calibration": str,
         "force_delay": float,
@@ -351,11 +350,9 @@ def _select_columns(recording: TomlTable) -> Selections:
     channels = ["angles", "time"]
     # Not every command reads the forces beside commands.
     if "commands" not in recording:
-        channels += [
-            channel
-            for channel in ("forces", "velocities")
-            if f"{channel}_file" not in recording
-        ]
+        channels.append("velocities")
+        if "forces_file" not in recording:
+            channels.append("forces")
     selections: dict[str, Selection] = {}
     for channel in channels:
         value = recording.get(channel)

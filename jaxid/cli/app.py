@@ -4,6 +4,7 @@ The package is imported when a command runs, so that `jaxid --help` answers at o
 """
 
 import dataclasses
+import functools
 import io
 import sys
 from pathlib import Path
@@ -154,7 +155,7 @@ def excite(
             f"`{earlier_design}` does not exist: `--resume` needs it to continue."
         )
     console = options.start(experiment=experiment)
-    from .best_motion import BestMotion
+    from .best_result import BestResult
 
     options.refuse_foreign_table(output)
     content = jid.experiment.load_experiment(experiment)
@@ -168,7 +169,15 @@ def excite(
         seconds -= monotonic() - start_time
     faults = [Remark(text, Status.BAD) for text in task.faults]
     terminal.show_remarks(terminal.open_console(stderr=True), faults)
-    with BestMotion(task, output) as best_motion, terminal.progress_bar() as progress:
+    note = f"; NOT CHECKED: {'; '.join(task.faults)}" if task.faults else ""
+    best_motion = BestResult(
+        output,
+        lambda motion: jid.workflow.write_best_motion(task, motion, output),
+        f"stopped: `{output}` and the files beside it hold the best motion so far, "
+        f"which keeps all limits that were checked{note}; `--resume` continues from it",
+        "stopped before a motion kept all limits, and nothing was written",
+    )
+    with best_motion, terminal.progress_bar() as progress:
         with within("excitation", experiment.name):
             design = jid.workflow.design_motion(
                 task, progress, best_motion.keep, seconds
@@ -284,13 +293,20 @@ def choose(
     """
     output = options.file_beside(experiment, output, "chosen.toml", force)
     console = options.start(*logs, experiment=experiment)
+    from jaxid.io import write_text
     from jaxid.report.model_choice_page import write_model_choice
 
-    from .best_file import BestFile
+    from .best_result import BestResult
 
     content = jid.experiment.load_experiment(experiment)
     page = output.with_suffix(".html")
-    with BestFile(output) as best_file, terminal.progress_bar() as progress:
+    best_file = BestResult(
+        output,
+        functools.partial(write_text, output),
+        f"stopped: `{output}` holds the best model so far",
+        "stopped before a change lowered the errors: nothing was written",
+    )
+    with best_file, terminal.progress_bar() as progress:
         choice = jid.experiment.choose_model(
             content, logs, seconds=seconds, keep=best_file.keep, progress=progress
         )

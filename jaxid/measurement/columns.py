@@ -436,33 +436,26 @@ def open_log(
     path: FilePath,
     columns: Columns,
     forces_path: FilePath | None = None,
-    velocities_path: FilePath | None = None,
     *,
     on_disk: bool = False,
-    is_lenient: bool = False,
 ) -> Log:
     """Open the files of a log; with `on_disk`, texts stay on the disk.
 
-    Rows that cannot be read are an error, unless `is_lenient`: then `Log.bad_rows`
-    names them.
+    Rows that cannot be read are an error there; otherwise `Log.bad_rows` names them.
     """
-    if velocities_path is not None and columns.velocities is None:
-        raise InputError(
-            "`velocities_path` is given, but `Columns.velocities` names no columns."
-        )
-    paths = {"forces": forces_path, "velocities": velocities_path}
+    paths = {"forces": forces_path or path}
     selections: dict[Path, dict[str, Selection | None]] = {}
     for channel in (*JOINT_CHANNELS, *OTHER_CHANNELS):
         selection = getattr(columns, channel)
         if selection is not None:
-            file_path = Path(paths.get(channel) or path)
+            file_path = Path(paths.get(channel, path))
             selections.setdefault(file_path, {})[channel] = selection
     if columns.time is not None or columns.sample_time is None:
         selections[Path(path)]["time"] = columns.time
     tables = []
     for file_path, file_selections in selections.items():
         file = open_log_file(file_path, file_selections, columns.joint_names)
-        bad_rows = {} if is_lenient else None
+        bad_rows = None if on_disk else {}
         tables.append(file.table(file.channels(), on_disk, bad_rows))
     for table in tables:
         if table.rows != tables[0].rows:

@@ -52,7 +52,6 @@ def read_recording(
     name: str | None = None,
     *,
     forces_path: FilePath | None = None,
-    velocities_path: FilePath | None = None,
     largest_gap: float | int = 1.75,
     bridged: float = 0.0,
     bad_rows: float = MAX_BAD_ROWS,
@@ -67,7 +66,6 @@ def read_recording(
         columns: Meaning of the columns.
         name: Name of the recording; the file's if None.
         forces_path: File with the forces.
-        velocities_path: File with the velocities.
         largest_gap: Longest pause that is bridged by interpolation, in sample times;
             longer ones split the recording into segments.
         bridged: Pause that is bridged in any case [s].
@@ -80,7 +78,7 @@ def read_recording(
         InputError: If a file, a column, a number or the time is invalid; the message
             names file, column and line.
     """
-    log = open_log(path, columns, forces_path, velocities_path, is_lenient=True)
+    log = open_log(path, columns, forces_path)
     channels = log.read()
     sample_time = columns.sample_time
     stamps = log.stamps() if sample_time is None else None
@@ -310,7 +308,6 @@ def scan_log(
     name: str | None = None,
     *,
     forces_path: FilePath | None = None,
-    velocities_path: FilePath | None = None,
     largest_gap: float | int = 1.75,
     start: float | int = -np.inf,
     stop: float | int = np.inf,
@@ -332,7 +329,6 @@ def scan_log(
         min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
         name: Name of the log; the file's if None.
         forces_path: File with the forces.
-        velocities_path: File with the velocities.
         largest_gap: Longest pause that is no gap, in sample times.
         start: Start of the part that counts, from the log's first row on [s].
         stop: End of the part that counts [s].
@@ -351,7 +347,7 @@ def scan_log(
         raise NeedsMemory("a floating base needs its whole log")
     if columns.unwrap:
         raise NeedsMemory("`unwrap` counts the turns of whole logs")
-    log = open_log(path, columns, forces_path, velocities_path, on_disk=True)
+    log = open_log(path, columns, forces_path, on_disk=True)
     table = log.tables[0]
     has_velocities = columns.velocities is not None
     name = printable(Path(path).stem) if name is None else name

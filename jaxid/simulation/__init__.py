@@ -9,10 +9,7 @@ from .friction_and_ripple import (
     TorqueRipple as TorqueRipple,
 )
 from .mechanics import Servo as Servo
-from .tx90l import (
-    cad_tx90l_on_rail as cad_tx90l_on_rail,
-    virtual_tx90l_on_rail as virtual_tx90l_on_rail,
-)
+from .tx90l import virtual_tx90l_on_rail as virtual_tx90l_on_rail
 from .virtual import (
     Sensors as Sensors,
     Tracking as Tracking,

@@ -90,19 +90,6 @@ def virtual_tx90l_on_rail(
     return virtual_robot.replace(friction=smooth_friction, ripple=None)
 
 
-def cad_tx90l_on_rail() -> np.ndarray:
-    """Return a CAD model of `virtual_tx90l_on_rail().model` without friction.
-
-    It describes bodies and rotors. Masses and rotors are 10 to 18 % off, each body as a
-    whole.
-    """
-    errors = 1.0 + np.array([0.15, -0.12, 0.18, -0.10, 0.14, -0.18, 0.11])
-    bodies = _bodies(COLD) * errors[:, None]
-    return np.concatenate(
-        [bodies.ravel(), np.zeros(14), np.array(ROTORS) * errors[::-1]]
-    )
-
-
 def _bodies(published: dict[int, float]):
     """Return seven parameters of each body with published base parameters (Eq. 24)."""
     entry = library.entries()["virtual_tx90l_on_rail"]

@@ -24,6 +24,7 @@ from .motion_design import (
     MotionTask as MotionTask,
     design_motion as design_motion,
     prepare_motion as prepare_motion,
+    write_best_motion as write_best_motion,
     write_design as write_design,
 )
 from .payload_gains_and_states import (

@@ -66,7 +66,7 @@ def read_log(setup: Setup, log: FilePath, columns: Columns) -> Recording:
         bad_rows=reading.bad_rows,
         start=reading.start,
         stop=reading.stop,
-        **reading.files(path),
+        forces_path=reading.forces_path(path),
     )
     require_plausible(recording, path, setup.robot)
     if reading.force_delay:
@@ -236,7 +236,7 @@ def open_long_log(
         largest_gap=reading.largest_gap,
         start=reading.start,
         stop=reading.stop,
-        **reading.files(path),
+        forces_path=reading.forces_path(path),
     )
 
 

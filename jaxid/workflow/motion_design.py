@@ -316,6 +316,13 @@ def write_design(
     return motion_files + pages
 
 
+def write_best_motion(task: MotionTask, motion: LinearTrajectory, output: Path) -> None:
+    """Write a motion of a search, as it can be played."""
+    robot = task.setup.robot
+    playable = make_playable(robot, task.excitation, motion)
+    write_motion(robot, task.excitation, playable, output)
+
+
 def write_motion(
     robot: Robot, excitation: Excitation, playable: PlayableMotion, output: Path
 ) -> list[Path]:

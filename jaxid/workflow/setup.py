@@ -98,7 +98,6 @@ class LogReading:
         forces_file: File of the forces, if they are in another file in the folder of
             the log, like `"{}_torque.csv"`: "{}" is replaced by the log's name without
             its suffix.
-        velocities_file: File of the velocities, likewise, like `"{}_speed.csv"`.
         lerobot_calibration: Calibration file of LeRobot for `angle_unit = "%"`, like
             `"my_arm.json"`: angles count from the middle of each calibrated range.
         force_delay: Time by which the forces in the log are late, compared with the
@@ -112,7 +111,6 @@ class LogReading:
     """
 
     forces_file: str | None = None
-    velocities_file: str | None = None
     lerobot_calibration: str | None = None
     force_delay: float = 0.0
     largest_gap: float = 1.75
@@ -120,16 +118,11 @@ class LogReading:
     start: float = -np.inf
     stop: float = np.inf
 
-    def files(self, log: Path) -> dict[str, Any]:
-        """Return the paths of the files beside a log, as the readers take them."""
-        names = {
-            "forces_path": self.forces_file,
-            "velocities_path": self.velocities_file,
-        }
-        return {
-            key: None if name is None else log.parent / name.replace("{}", log.stem)
-            for key, name in names.items()
-        }
+    def forces_path(self, log: Path) -> Path | None:
+        """Return the path of the file with the forces of a log, if it has one."""
+        if self.forces_file is None:
+            return None
+        return log.parent / self.forces_file.replace("{}", log.stem)
 
 
 class Setup(eqx.Module):

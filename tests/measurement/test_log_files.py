@@ -145,19 +145,15 @@ def test_nanoseconds_since_1970_keep_their_precision(tmp_path):
 
 def test_several_files(tmp_path):
     log = a_log()
-    for group, name in {"q": "Joint_", "tau": "Joint_", "dq": "v"}.items():
-        write_csv(
-            tmp_path / f"{group}.csv",
-            {f"{name}{j}": log[f"{group}{j}"] for j in (1, 2)},
-        )
+    motion = {f"Joint_{j}": log[f"q{j}"] for j in (1, 2)}
+    motion |= {f"v{j}": log[f"dq{j}"] for j in (1, 2)}
+    write_csv(tmp_path / "q.csv", motion)
+    write_csv(tmp_path / "tau.csv", {f"Joint_{j}": log[f"tau{j}"] for j in (1, 2)})
     columns = Columns(
         angles="Joint_{}", forces="Joint_{}", velocities="v{}", sample_time=0.004
     )
-    paths = {
-        "forces_path": tmp_path / "tau.csv",
-        "velocities_path": tmp_path / "dq.csv",
-    }
-    r = read_recording(tmp_path / "q.csv", columns, "run", **paths)
+    forces = tmp_path / "tau.csv"
+    r = read_recording(tmp_path / "q.csv", columns, "run", forces_path=forces)
     check(r, log)
     assert r.name == "run"
 
@@ -388,7 +384,6 @@ def test_lengths_and_shapes_must_agree(tmp_path):
     path = write_csv(tmp_path / "q.csv", log)
     forces = write_csv(tmp_path / "tau.csv", {k: v[:-1] for k, v in log.items()})
     refused(path, COLUMNS, "11 rows", "has 12", forces_path=forces)
-    refused(path, PLAIN, "`Columns.velocities`", velocities_path=forces)
     refused(
         path, Columns("q{}", "tau{}", time="t", angle_offsets=(1.0,)), "`angle_offsets`"
     )
