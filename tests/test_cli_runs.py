@@ -229,53 +229,14 @@ def test_a_delay_is_seen_and_removed(shop, run):  # noqa: F811
     assert "force_delay" not in out
 
 
-def test_a_report_takes_later_logs(folder, first, run):  # noqa: F811
-    # All logs together would find other speeds of the transition than the first.
-    text = (folder / "experiment.toml").read_text(encoding="utf-8")
-    given = text.replace("[recording]", "[model.coulomb]\nepsilon = 0.01\n[recording]")
-    (folder / "given.toml").write_text(given, encoding="utf-8")
-    assert run("identify", "given.toml", "a.csv", "-o", "given")[0] == 0
-    assert run("identify", "given.toml", "a.csv", "b.csv", "-o", "all")[0] == 0
-    code, _, err = run("identify", "given.toml", "given/", "b.csv", "-o", "both")
-    assert (code, err) == (0, "")
-    added, together = result(folder, "both"), result(folder, "all")
-    for one, other in zip(
-        added["base_parameters"], together["base_parameters"], strict=True
-    ):
-        assert one["estimate"] == pytest.approx(other["estimate"], rel=1e-9, abs=1e-12)
-    assert added["fit"]["recordings"] == ["a", "b"]
-    assert added["fit"]["rows"] == together["fit"]["rows"]
-    assert added["settings"]["identification"] == ["given", "b.csv"]
-    assert [e["recording"] for e in added["errors"]["identification"]] == ["b"]
-    said = "contain the same data"
-    assert refused(
-        run("identify", "experiment.toml", "first", "a.csv", "-o", "twice"), said
-    )
-    said = "a report that was given already contains the data of `a`"
-    seen = ("first", "b.csv", "--verify", "a.csv", "-o", "twice")
-    assert refused(run("identify", "experiment.toml", *seen), said)
-    assert not (folder / "twice").exists()
-
-
 FOREIGN = [
-    ("", "identify e.toml other b.csv", "holds no `model.json`"),
-    ("", "identify e.toml first", "at least one log"),
-    (
-        "[estimator]\nridge = 0.1",
-        "identify e.toml first b.csv",
-        "to least squares only",
-    ),
-    (
-        "[model]\nsprings = true",
-        "identify e.toml first b.csv",
-        "different base parameters",
-    ),
+    ("", "identify e.toml first b.csv", "is not a file or a ROS 2 bag"),
     (
         "",
         "payload e.toml a.csv --loaded b.csv --body elbow",
         "`--body` must be the name of the jo",
     ),
-    ("", "states e.toml a.csv", "one log or report for each of two or more states"),
+    ("", "states e.toml a.csv", "one log for each of two or more states"),
     ("", "gains e.toml a.csv --loaded b.csv", "the table `[load]` is missing"),
 ]
 

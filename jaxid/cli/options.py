@@ -67,19 +67,10 @@ XacroArguments = Annotated[
     ),
 ]
 Paths = list[Path]
-Logs = Annotated[
-    Paths,
-    typer.Argument(
-        help="Logs, or the folder of an earlier report to add its logs.",
-        metavar="LOG",
-    ),
-]
+Logs = Annotated[Paths, typer.Argument(help="Logs of the robot.", metavar="LOG")]
 OptionalLogs = Annotated[
     Paths | None,
-    typer.Argument(
-        help="Logs without the load, or the folder of an earlier report.",
-        metavar="LOG",
-    ),
+    typer.Argument(help="Logs without the load.", metavar="LOG"),
 ]
 Verified = Annotated[
     Paths | None,
@@ -91,9 +82,7 @@ Verified = Annotated[
 ]
 Loaded = Annotated[
     Paths,
-    typer.Option(
-        metavar="LOG", help="A log with the load, or a report; may be repeated."
-    ),
+    typer.Option(metavar="LOG", help="A log with the load; may be repeated."),
 ]
 
 

@@ -102,7 +102,7 @@ def states(
 ) -> None:
     """Fit several states at once: one inertia, friction for each.
 
-    One log or report for each, like cold and warm. Friction and offsets are each
+    One log for each, like cold and warm. Friction and offsets are each
     state's own, all else is shared.
     """
     console = options.start(*logs, experiment=experiment, output=output, force=force)

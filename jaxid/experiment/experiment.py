@@ -22,7 +22,6 @@ from jaxid.robot.virtual_joints import driven_robot, with_driven
 from jaxid.workflow.excitation_settings import Excitation
 from jaxid.workflow.force_sensor_payload import ForceSensor
 from jaxid.workflow.geometry_calibration import CalibrationSettings
-from jaxid.workflow.log_loading import is_report
 from jaxid.workflow.log_rollout import ServoSettings, TorqueSettings
 from jaxid.workflow.setup import LogReading, Setup
 from jaxid.workflow.surroundings import Collision, Surroundings
@@ -99,11 +98,8 @@ class Experiment:
         """
         if self.columns is not None:
             return self.columns
-        files = [log for log in logs if not is_report(log)]
-        description = "the columns of the logs"
-        if files:
-            names = summarise_columns(files[0])
-            description = f"columns of `{files[0].name}`, which has {names}"
+        names = summarise_columns(logs[0])
+        description = f"columns of `{logs[0].name}`, which has {names}"
         raise InputError(
             f"{self.path.name}: the table `[recording]` "
             f"is missing: it names {description}."

@@ -237,6 +237,8 @@ def build_columns(
         [Columns, Sides, LogReading], table, "recording", skip=SIDES
     )
     if "forces" not in arguments:
+        if wrench is None and "commands" not in arguments:
+            raise InputError("`recording.forces` is missing: `[recording]` needs it.")
         arguments["wrench"] = wrench
     with within("recording"):
         if "lerobot_calibration" in reading:

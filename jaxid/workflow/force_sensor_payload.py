@@ -24,7 +24,7 @@ from jaxid.robot.rotations import rpy_rotation
 from jaxid.validation.diagnosis import diagnose
 from jaxid.validation.wrench_checks import wrench_remarks
 
-from .log_loading import is_report, read_log
+from .log_loading import read_log
 from .setup import Progress, Setup
 
 PART_TIME = 60.0
@@ -83,19 +83,11 @@ def sensor_logs(
     columns: Columns,
     progress: Progress,
 ) -> tuple[list[Observations], list[Remark]]:
-    """Return logs with a wrench, and what is wrong with them.
-
-    Raises:
-        InputError: If an earlier report is given, which holds no wrench.
-    """
+    """Return logs with a wrench, and what is wrong with them."""
     robot = base.model.robot
     logs = []
     remarks = []
     for path in paths:
-        if is_report(path):
-            raise InputError(
-                f"`{path.name}` is a report, which holds no wrench: give its log."
-            )
         progress(f"reading {path.name}", 0.0)
         recording = read_log(setup, path, columns)
         log = observe(recording, robot, setup.filter, setup.decimation, setup.min_speed)

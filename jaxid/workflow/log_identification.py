@@ -11,25 +11,17 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.errors import InputError
-from jaxid.identification.combination import (
-    combine_fits,
-    has_common_rows,
-    replace_estimates,
-    require_same_base,
-    without_bounds,
-)
+from jaxid.identification.combination import without_bounds
 from jaxid.identification.delay import with_unknown_delay
 from jaxid.identification.encoder_resolution import resolution_note
-from jaxid.identification.estimators import GivenWeights
 from jaxid.identification.fit_result import Fit
-from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.report.identification_page import body_table, motor_tables
-from jaxid.report.result_files import read_fit, write_report
+from jaxid.report.result_files import write_report
 from jaxid.result_table import Remark, Summarised, Table
 from jaxid.robot.collision_geometry import BodyShape
 from jaxid.validation.diagnosis import mistakes_in_logs
@@ -41,7 +33,7 @@ from jaxid.validation.torque_errors import (
     validate,
 )
 
-from .log_loading import LoadedLog, fitted_share, is_report, load_logs, select_filter
+from .log_loading import LoadedLog, fitted_share, load_logs, select_filter
 from .robot_file import RobotFile
 from .setup import Paths, Progress, Setup, ignore_progress
 
@@ -146,7 +138,7 @@ def identify_logs(
 
     Args:
         setup: How logs become parameters.
-        logs: Paths of logs; folders of earlier reports add what those have seen.
+        logs: Paths of logs.
         columns: Meaning of the columns of the logs.
         held_out: Fraction of each log, its last part, that is kept for the validation.
         verify: Paths of further logs for the validation.
@@ -158,16 +150,10 @@ def identify_logs(
     logs = [Path(log) for log in logs]
     verify = [Path(log) for log in verify]
     require_separate_logs(logs, verify, held_out)
-    files = [path for path in logs if not is_report(path)]
-    reports = [path for path in logs if is_report(path)]
-
-    if reports:
-        setup = setup.with_transition_speeds_of(read_earlier_fit(setup, reports[0]))
-    setup = select_filter(setup, files, columns, progress, held_out)
-    loaded_logs = load_logs(setup, [*files, *verify], columns, progress)
-    fitted_logs = loaded_logs[: len(files)]
-    parts = split_logs(loaded_logs, len(files), held_out)
-
+    setup = select_filter(setup, logs, columns, progress, held_out)
+    loaded_logs = load_logs(setup, [*logs, *verify], columns, progress)
+    fitted_logs = loaded_logs[: len(logs)]
+    parts = split_logs(loaded_logs, len(logs), held_out)
     progress("finding base parameters", 0.0)
     base = setup.base
     rows = RegressionProblem(
@@ -182,9 +168,6 @@ def identify_logs(
     mistakes = mistakes_in_logs(diagnoses, without_bounds(fit), bodies)
     if mistakes.delay is not None:
         fit = with_unknown_delay(fit, rows, mistakes.delay)
-    if reports:
-        fit = add_reports(setup, reports, fit, parts.unseen_logs)
-
     validation = validate(
         fit, parts.every, progress=partial(progress, "predicting torques")
     )
@@ -235,10 +218,6 @@ def require_separate_logs(
         raise InputError(
             f"`{Path(min(shared_places)).name}` is given both for the fit and for "
             "validation: use `--split`, or `held_out` in Python."
-        )
-    if all(map(is_report, logs)):
-        raise InputError(
-            "give at least one log as a file, for torque errors and figures."
         )
 
 
@@ -297,53 +276,3 @@ def errors_of_claims(setup: Setup, fit: Fit, logs: Sequence[Observations]) -> Cl
     is_claimed = [names[k] in values for k in fit.base.indices]
     claimed_parameters = np.where(is_claimed, parameters, np.nan)
     return Claims(errors, claimed_parameters, setup.robot_file.bodies())
-
-
-def read_earlier_fit(setup: Setup, folder: Path) -> Fit:
-    """Return the fit of the report in a folder.
-
-    Raises:
-        InputError: If its base parameters are not those of the setup.
-    """
-    fit = read_fit(folder)
-    fit_of_setup = dataclasses.replace(fit, base=setup.base, name="these logs")
-    try:
-        require_same_base((fit, fit_of_setup))
-    except InputError as error:
-        raise InputError(f"`{folder}` does not fit these logs: {error}") from error
-    return fit
-
-
-def add_reports(
-    setup: Setup, reports: Sequence[Path], fit: Fit, unseen_logs: Sequence[Observations]
-) -> Fit:
-    """Return a fit to all logs, also those of earlier reports.
-
-    The reports must not have seen the unseen logs.
-    """
-    has_bodies = fit.consistency is not None
-    if fit.base.names != setup.base.names or not (has_bodies or fit.is_least_squares):
-        raise InputError(
-            "earlier reports can be added to least squares only, but the estimator is "
-            f"{fit.estimator}: leave `[estimator]` out, or give the logs themselves."
-        )
-    earlier_fits = [read_earlier_fit(setup, folder) for folder in reports]
-    fit = functools.reduce(combine_fits, [*earlier_fits, fit])
-    if setup.has_bounded_bodies:
-        fit = bound_bodies(setup, fit)
-    for log in unseen_logs:
-        rows = RegressionProblem(setup.base, [log])
-        if fit.blocks is not None and has_common_rows(fit.blocks, rows.blocks):
-            raise InputError(
-                "a report that was given already contains the data "
-                f"of `{log.name}`: verify with another log."
-            )
-    return fit
-
-
-def bound_bodies(setup: Setup, fit: Fit) -> Fit:
-    """Return a fit whose bodies can exist, from factors of one without that bound."""
-    rows = RegressionProblem(fit.base, blocks=fit.time_blocks, names=fit.recordings)
-    estimator = dataclasses.replace(setup.estimator, weights=GivenWeights(fit.weights))
-    bounded_fit = dataclasses.replace(fit_problem(rows, estimator), name=fit.name)
-    return replace_estimates(bounded_fit, bounded_fit.parameters, fit.uncertainty)

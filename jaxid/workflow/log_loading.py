@@ -14,7 +14,7 @@ from jaxid.errors import InputError
 from jaxid.identification.filter_selection import choose_filter
 from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.log_files import estimated_rows, is_bag_folder
+from jaxid.measurement.log_files import estimated_rows
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.reading import read_excerpt, read_recording, scan_log
 from jaxid.measurement.recording import Recording, remove_delay
@@ -117,11 +117,6 @@ def read_commands(setup: Setup, log: Path, columns: Columns) -> Recording:
 def is_long(log: Path) -> bool:
     """Return whether a log is better read part by part than as a whole."""
     return estimated_rows(log) >= LONG_LOG_ROWS
-
-
-def is_report(path: Path) -> bool:
-    """Return whether a folder is an earlier report, and no bag."""
-    return path.is_dir() and not is_bag_folder(path)
 
 
 def load_logs(

@@ -1,7 +1,6 @@
 """Several runs of a robot: payload, gains of drives, states like cold and warm."""
 
 import dataclasses
-import functools
 import os
 from collections.abc import Mapping, Sequence
 from functools import partial
@@ -12,7 +11,6 @@ import numpy as np
 
 from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
-from jaxid.identification.combination import combine_fits
 from jaxid.identification.drive_gains import DriveGains, identify_drive_gains
 from jaxid.identification.estimators import Complete
 from jaxid.identification.fit_result import Fit
@@ -42,8 +40,7 @@ from jaxid.validation.diagnosis import mistakes_in_logs
 from jaxid.validation.torque_errors import TorqueErrors, torque_errors
 
 from .force_sensor_payload import ForceSensor, payload_of_logs, sensor_logs
-from .log_identification import read_earlier_fit
-from .log_loading import is_report, load_logs, select_filter
+from .log_loading import load_logs, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
 
 PAYLOAD_KEYS = ("mass", "centre_of_mass", "inertia", "estimate", "distance")
@@ -56,9 +53,9 @@ class Runs(NamedTuple):
     """Fits of several runs, and doubts about their logs."""
 
     fits: list[Fit]
-    logs: list[list[Observations]]  # logs of each run that were given as files
+    logs: list[list[Observations]]  # logs of each run
     doubts: list[str]
-    sources: Mapping[str, Sequence[Path]]  # logs and reports of each run
+    sources: Mapping[str, Sequence[Path]]  # paths of the logs of each run
     gain_doubts: list[str]  # doubts about the gains of the forces
 
 
@@ -68,11 +65,11 @@ def fit_runs(
     columns: Columns,
     progress: Progress = ignore_progress,
 ) -> Runs:
-    """Fit the logs and earlier reports of each run, by weighted least squares.
+    """Fit the logs of each run, by weighted least squares.
 
     Args:
         setup: How logs become parameters.
-        groups: Logs and reports of each run, by its name.
+        groups: Logs of each run, by its name.
         columns: Meaning of the columns of the logs.
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
@@ -84,11 +81,7 @@ def fit_runs(
         )
     progress("finding base parameters", 0.0)
     paths = [path for group in groups.values() for path in group]
-    files = [path for path in paths if not is_report(path)]
-    reports = [path for path in paths if is_report(path)]
-    if reports:
-        setup = setup.with_transition_speeds_of(read_earlier_fit(setup, reports[0]))
-    setup = select_filter(setup, files, columns, progress)
+    setup = select_filter(setup, paths, columns, progress)
     runs = Runs([], [], doubts, groups, [])
     for name in groups:
         fit = add_run(runs, setup, name, columns, progress)
@@ -107,24 +100,17 @@ def has_plain_estimator(setup: Setup) -> bool:
 def add_run(
     runs: Runs, setup: Setup, name: str, columns: Columns, progress: Progress
 ) -> Fit:
-    """Add the fit to logs and earlier reports of one run, its logs, and doubts."""
-    paths = runs.sources[name]
-    fits = [read_earlier_fit(setup, path) for path in paths if is_report(path)]
-    files = [path for path in paths if not is_report(path)]
-    observations = []
-    if files:
-        logs = load_logs(setup, files, columns, progress)
-        observations = [log.observations for log in logs]
-        row_progress = partial(progress, f"factorising the rows, {name}")
-        base = identify_transition_speeds(setup.base, observations)
-        rows = RegressionProblem(base, observations, row_progress)
-        fit = fit_problem(rows, setup.least_squares)
-        fits.append(fit)
-        mistakes = mistakes_in_logs([log.diagnosis for log in logs], fit)
-        runs.doubts.extend(text for log in logs for text in log.findings)
-        doubts = runs.gain_doubts if mistakes.are_gains else runs.doubts
-        doubts.extend(mistakes.certain)
-    fit = dataclasses.replace(functools.reduce(combine_fits, fits), name=name)
+    """Add the fit to the logs of one run, these logs, and doubts."""
+    logs = load_logs(setup, runs.sources[name], columns, progress)
+    observations = [log.observations for log in logs]
+    row_progress = partial(progress, f"factorising the rows, {name}")
+    base = identify_transition_speeds(setup.base, observations)
+    rows = RegressionProblem(base, observations, row_progress)
+    fit = dataclasses.replace(fit_problem(rows, setup.least_squares), name=name)
+    mistakes = mistakes_in_logs([log.diagnosis for log in logs], fit)
+    runs.doubts.extend(text for log in logs for text in log.findings)
+    doubts = runs.gain_doubts if mistakes.are_gains else runs.doubts
+    doubts.extend(mistakes.certain)
     runs.fits.append(fit)
     runs.logs.append(observations)
     return fit
@@ -184,8 +170,8 @@ def identify_payload_from_logs(
 
     Args:
         setup: How logs become parameters.
-        unloaded: Logs and folders of reports without the payload.
-        loaded: Logs and folders of reports with the payload.
+        unloaded: Logs without the payload.
+        loaded: Logs with the payload.
         columns: Meaning of the columns of the logs.
         body: Joint that moves the payload; the last one by default.
         mass: Mass of the payload, if it is known [kg].
@@ -296,8 +282,8 @@ def identify_gains_from_logs(
 
     Args:
         setup: How logs become parameters.
-        unloaded: Logs and folders of reports without the load.
-        loaded: Logs and folders of reports with the load.
+        unloaded: Logs without the load.
+        loaded: Logs with the load.
         columns: Meaning of the columns of the logs.
         load: The load; or its mass if it is at the end-effector [kg].
         progress: Callback, called with a stage and its completed fraction (0 to 1).
@@ -346,8 +332,7 @@ def identify_states_from_logs(
 
     Args:
         setup: How logs become parameters.
-        logs: A log, or the folder of a report, for each state; their names are those of
-            the states.
+        logs: A log for each state; their names are those of the states.
         columns: Meaning of the columns of the logs.
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
@@ -355,8 +340,7 @@ def identify_states_from_logs(
     groups = {Path(os.path.realpath(path)).stem: [path] for path in paths}
     if len(groups) < max(len(paths), 2):
         raise InputError(
-            "give one log or report for each of two "
-            "or more states, with different names."
+            "give one log for each of two or more states, with different names."
         )
     runs = fit_runs(setup, groups, columns, progress)
     states = identify_states(runs.fits)

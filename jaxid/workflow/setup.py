@@ -61,7 +61,7 @@ LOAD_FRICTION_TOLERANCE = 1e-3
 """Relative change of the friction by load, from fit to fit, that counts as none."""
 
 Paths = Sequence[str | Path]
-"""Paths of logs, and of folders of earlier reports."""
+"""Paths of logs."""
 Unknowns = BaseParameters | Model
 """Parameters that are to be identified, or their model."""
 Progress = Callable[[str, float], None]

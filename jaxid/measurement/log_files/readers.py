@@ -36,7 +36,7 @@ def open_log_file(
         return BagFile(path, selections, joint_names)
     if not path.is_file():
         raise InputError(
-            f"`{path}` is not a file or a ROS 2 bag: check the path of the log."
+            f"`{path}` is not a file or a ROS 2 bag: give the path of a log."
         )
     reader = READERS.get(path.suffix.lower())
     if reader is None:
