@@ -22,7 +22,6 @@ angles = "position{}"
 commands = "command{}"
 time = "time"
 [rollout]
-saturation = true
 samples = 2
 alike = []
 """
