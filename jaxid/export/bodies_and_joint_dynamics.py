@@ -56,8 +56,10 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
         if term.body_parameters:
             continue
         names = [name for name, _ in term.parameters(robot)]
+        # Friction that is scaled by temperature keeps its role.
+        unscaled_term = getattr(term, "term", term)
         roles = np.repeat(
-            [x.role or "" for x in term.joint_parameters], len(robot.driven)
+            [x.role or "" for x in unscaled_term.joint_parameters], len(robot.driven)
         )
         # Other parameters, such as those of ripple, have no role.
         roles = np.append(roles, [""] * (len(names) - len(roles)))

@@ -243,11 +243,6 @@ class TemperatureScaled(AbstractTerm):
     temperature: EachJoint = 25.0
     reference: float = eqx.field(static=True, default=25.0)
 
-    @property
-    def joint_parameters(self):
-        """Those of the term."""
-        return self.term.joint_parameters
-
     def parameters(self, robot):
         """Return those of the term."""
         return self.term.parameters(robot)
