@@ -74,6 +74,7 @@ class DescribedLog:
     Attributes:
         log: Filtered log.
         geometry: Geometry of the robot.
+        has_force: Whether the force of each joint is not 0 throughout.
         judge: Rows that count, and the score of a description.
         rows: Rows of the log as it is described.
     """
@@ -92,7 +93,9 @@ class DescribedLog:
         self._has_springs = "ks1" in model.parameter_names
         self.log = log
         self.geometry = Geometry.of(robot)
-        self.judge = Judge(log.is_moving, log.folds)
+        # A column of zeros is judged by what the other joints say of it.
+        self.has_force = np.any(log.forces != 0, axis=0)
+        self.judge = Judge(log.is_moving & self.has_force, log.folds)
         self._body_columns = _BodyColumns(robot)
         self._body_rows = log.rows_of(self.samples_of_bodies(log.motion))
         is_friction_alone = log.friction_shares > MAX_FRICTION_SHARE
@@ -162,8 +165,11 @@ class DescribedLog:
         """
         columns = self._joined(body_rows, self.samples_of_friction(motion, forces))
         force_rows = self.log.rows_of(forces)
-        sizes = np.sqrt(np.mean(self.log.force_rows**2, axis=0))
-        ratios = sizes / np.maximum(np.sqrt(np.mean(force_rows**2, axis=0)), 1e-300)
+        log_sizes = np.sqrt(np.mean(self.log.force_rows**2, axis=0))
+        sizes = np.sqrt(np.mean(force_rows**2, axis=0))
+        # A column without forces has no size to keep.
+        ratios = np.ones_like(sizes)
+        np.divide(log_sizes, sizes, out=ratios, where=(sizes > 0) & (log_sizes > 0))
         return Rows(columns * ratios[:, None], force_rows * ratios)
 
     def without_gravity_and_coriolis(self) -> Rows:

@@ -164,7 +164,7 @@ def judge(report: Report) -> Judgement:
         _judge_mass_matrix(report.definiteness),
         *_judge_bounds(fit),
         *_judge_offsets(fit),
-        *_judge_claims(report.claimed),
+        *_judge_claims(report.claimed, report.fit.base.model.robot.joint_names),
         *_judge_friction(fit, report.identification),
         *_remarks_on_fit(report),
         *(Remark(note) for note in report.every_note if note not in bound_notes),
@@ -303,23 +303,33 @@ def _judge_offsets(fit: Fit) -> Iterator[Remark]:
             )
 
 
-def _judge_claims(claimed: Sequence[TorqueErrors]) -> Iterator[Remark]:
+def _judge_claims(
+    claimed: Sequence[TorqueErrors], names: Sequence[str]
+) -> Iterator[Remark]:
     """Compare the size of the forces with those of the bodies of the robot's file.
 
     A fit of forces in a wrong unit is as good as any, but its masses are not.
     """
     for log in claimed[:1]:
-        claim = float(np.linalg.norm(log.predicted))
-        size = float(np.linalg.norm(log.measured))
-        if claim > MAX_CLAIM_RATIO * size > 0:
-            ratio = significant(claim / size, 2)
-            yield Remark(
-                f"With the bodies in the robot's file, the motion would need {ratio} "
-                "times the forces of the logs: are the forces currents "
-                "(`recording.torque_constants`), motor torques (`forces_side`) or in "
-                "another unit (`force_unit`), or is the file wrong?",
-                Status.DOUBTFUL,
+        claims = np.linalg.norm(log.predicted, axis=0)
+        sizes = np.linalg.norm(log.measured, axis=0)
+        cause = (
+            "are the forces currents (`recording.torque_constants`), motor torques "
+            "(`forces_side`) or in another unit (`force_unit`), or is the file wrong?"
+        )
+        ratio = float(np.linalg.norm(claims) / max(np.linalg.norm(sizes), 1e-300))
+        if ratio > MAX_CLAIM_RATIO:
+            forces = f"{significant(ratio, 2)} times the forces of the logs"
+            text = (
+                f"With the bodies in the robot's file, the motion would need {forces}"
             )
+            yield Remark(f"{text}: {cause}", Status.DOUBTFUL)
+            continue
+        is_small = (sizes > 0) & (claims > MAX_CLAIM_RATIO * sizes)
+        for j in map(int, np.flatnonzero(is_small)):
+            forces = f"{significant(claims[j] / sizes[j], 2)} times its logged force"
+            text = f"With the bodies in the robot's file, joint `{names[j]}` would need"
+            yield Remark(f"{text} {forces}: {cause}", Status.DOUBTFUL)
 
 
 def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:

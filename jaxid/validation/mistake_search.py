@@ -17,8 +17,16 @@ from .contacts import Contact, concentration, find_contact
 from .descriptions import MAX_FRICTION_SHARE, DescribedLog
 from .filtered_log import FilteredLog
 from .gravity_witness import gravity_witness
+from .odd_joint import (
+    OddJoint,
+    log_gain,
+    missing_force_texts,
+    odd_joint,
+    odd_joint_text,
+)
 from .rest import rest_remarks
 from .row_fits import RowFit, Rows, promise
+from .several_signs import several_signs, signs_text
 from .suspects import UNIT_START, Quantity, Suspect, SuspectedMistakes
 
 
@@ -172,6 +180,9 @@ def find_mistakes(
     described_log = DescribedLog(model, log)
     if commands and are_exchanged(described_log, recordings, commands):
         return Mistakes(explained=(EXCHANGED_COMMANDS,))
+    missing_forces = missing_force_texts(described_log)
+    if missing_forces:
+        return Mistakes(explained=tuple(missing_forces))
     delay = common_delay(described_log)
     rest = rest_remarks(described_log)
     mistakes = _mistakes_of_all(described_log, recordings, bodies)
@@ -199,7 +210,7 @@ def _mistakes_of_all(
     suspected = SuspectedMistakes(described_log, recordings[0], bodies)
     suspects = [*suspected.of_columns(), *suspected.of_robot()]
     is_one_log = len(recordings) == 1
-    return _search(described_log, suspects, suspected.quantities(), is_one_log)
+    return _search(described_log, suspected, suspects, is_one_log)
 
 
 def _mistakes_by_log(
@@ -243,21 +254,25 @@ def _mistakes_in_columns(model: Model, recording: Recording) -> Mistakes:
         return Mistakes()
     described_log = DescribedLog(model, log)
     suspected = SuspectedMistakes(described_log, recording)
-    suspects = suspected.of_columns()
-    return _search(described_log, suspects, suspected.quantities(), is_one_log=True)
+    suspects = [*suspected.of_columns()]
+    return _search(described_log, suspected, suspects, is_one_log=True)
 
 
 def _search(
     described_log: DescribedLog,
-    suspects: Iterable[Suspect],
-    quantities: Iterable[Quantity],
+    suspected: SuspectedMistakes,
+    suspects: Sequence[Suspect],
     is_one_log: bool,
 ) -> Mistakes:
     """Return what explains most: a mistake, in one log also a contact, or nothing."""
     judge = described_log.judge
     fit = judge.fit(described_log.rows)
     misfit = _misfit(fit, described_log.rows)
-    results = explanations(described_log, suspects, quantities)
+    odd = odd_joint(described_log) if misfit > MAX_CURED_MISFIT else None
+    large_gains = _large_gains(described_log, suspected, odd)
+    results = explanations(
+        described_log, [*suspects, *large_gains], suspected.quantities()
+    )
     gain = results[0].gain if results else 0.0
     if is_one_log:
         contact = find_contact(described_log, fit)
@@ -269,21 +284,63 @@ def _search(
     texts = ", or ".join(x.sentence for x in equal_results)
     is_single = 0 < len(equal_results) <= MAX_EQUAL
     if is_single and _is_cure(equal_results[0], misfit):
-        remaining_misfit = equal_results[0].misfit
-        effect = (
-            f"the torque error is then {100 * remaining_misfit:.2g} % instead of "
-            f"{100 * misfit:.2g} %."
-        )
+        effect = _effect_text(misfit, equal_results[0].misfit)
         are_gains = all(x.is_gain for x in equal_results)
         return Mistakes(explained=(f"{texts}: {effect}",), are_gains=are_gains)
+    if misfit > MAX_CURED_MISFIT:
+        signs_sentence = _signs_sentence(described_log, suspected, misfit)
+        if signs_sentence:
+            return Mistakes(explained=(signs_sentence,))
     if misfit > MAX_MISFIT:
-        return Mistakes(unexplained=(_misfit_text(described_log, fit),))
+        text = _misfit_text(described_log, fit)
+        if odd is not None:
+            text = odd_joint_text(described_log, odd, misfit)
+        return Mistakes(unexplained=(text,))
     powers = described_log.friction_powers(described_log.rows, fit)
     if powers.min() < MIN_POWER and misfit < MAX_POWER_MISFIT:
         return Mistakes(explained=(_driving_text(described_log, powers),))
     if is_single and _is_possible(equal_results[0], misfit):
         return Mistakes(possible=(f"possible, but not sure: {texts}.",))
+    if odd is not None:
+        return Mistakes(possible=(odd_joint_text(described_log, odd, misfit),))
     return Mistakes()
+
+
+def _large_gains(
+    described_log: DescribedLog, suspected: SuspectedMistakes, odd: OddJoint | None
+) -> list[Suspect]:
+    """Return the gain of the odd joint's force, if it has one."""
+    center = log_gain(odd)
+    if odd is None or center is None:
+        return []
+    quantity = suspected.gain(odd.joint, center)
+    amount = _best_amount(described_log, quantity)
+    return [
+        Suspect(quantity.sentence(amount), lambda: quantity.rows(amount), is_gain=True)
+    ]
+
+
+def _signs_sentence(
+    described_log: DescribedLog, suspected: SuspectedMistakes, misfit: float
+) -> str:
+    """Return a sentence about several signs, if they are wrong."""
+    for signs in several_signs(described_log, suspected):
+        rows = suspected.rows_of_signs(*signs)
+        fit = described_log.judge.fit(rows)
+        remaining_misfit = _misfit(fit, rows)
+        power = described_log.friction_powers(rows, fit).min()
+        if remaining_misfit < MAX_CURED_MISFIT and power > MIN_POWER:
+            text = signs_text(described_log, signs)
+            return f"{text}: {_effect_text(misfit, remaining_misfit)}"
+    return ""
+
+
+def _effect_text(misfit: float, remaining_misfit: float) -> str:
+    """Return how much less of the forces a model misses without a mistake."""
+    return (
+        f"the torque error is then {100 * remaining_misfit:.2g} % instead of "
+        f"{100 * misfit:.2g} %."
+    )
 
 
 def _contact_text(described_log: DescribedLog, contact: Contact) -> str:
@@ -319,7 +376,8 @@ def _is_cure(explanation: Explanation, misfit: float) -> bool:
     """Return whether a mistake explains more than effects that the model lacks."""
     max_misfit = max(MAX_CURED_MISFIT, GAINS.named_rest * misfit)
     is_large = explanation.gain >= GAINS.named and explanation.misfit < max_misfit
-    return is_large and explanation.remainder < GAINS.remainder
+    is_braked = explanation.power > MIN_POWER
+    return is_large and is_braked and explanation.remainder < GAINS.remainder
 
 
 def _is_possible(explanation: Explanation, misfit: float) -> bool:
@@ -377,7 +435,8 @@ def explanations(
     for suspect in suspects:
         suspect_rows = suspect.rows()
         gain = score - judge.fit(suspect_rows).score
-        trials.append(_Trial(gain, suspect.sentence, suspect_rows))
+        is_gain = suspect.is_gain
+        trials.append(_Trial(gain, suspect.sentence, suspect_rows, is_gain))
     trials += _searched_quantities(described_log, list(quantities))
     trials.sort(key=lambda trial: -trial.gain)
 

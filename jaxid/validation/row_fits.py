@@ -26,9 +26,17 @@ class Rows(NamedTuple):
     columns: np.ndarray
     forces: np.ndarray
 
+    @property
+    def force_sizes(self) -> np.ndarray:
+        """RMS forces of the joints; for joints without force that of all."""
+        squares = np.mean(self.forces**2, axis=0)
+        mean_square = squares.mean()
+        typical_square = mean_square if mean_square > 0 else 1.0
+        return np.sqrt(np.where(squares > 0, squares, typical_square))
+
     def relative_errors(self, squares: np.ndarray) -> np.ndarray:
         """Return the RMS errors of the joints over their RMS forces."""
-        return np.sqrt(squares / (np.mean(self.forces**2, axis=0) + 1e-300))
+        return np.sqrt(squares) / self.force_sizes
 
 
 class RowFit(NamedTuple):
@@ -73,13 +81,13 @@ class Judge:
 
     def force_weights(self, rows: Rows) -> np.ndarray:
         """Return weights of the joints before any error is known."""
-        return 1 / np.sqrt(np.mean(rows.forces**2, axis=0) + 1e-300)
+        return 1 / rows.force_sizes
 
     def weighted_fit(self, rows: Rows, weights: np.ndarray) -> RowFit:
         """Fit the parameters with given weights of the joints."""
         parameters, factor, scales = _solution(rows, self.mask * weights)
         errors = (rows.forces - rows.columns @ parameters) * self.mask
-        squares = self.mean_squares(errors, rows.forces)
+        squares = self.mean_squares(errors, rows)
         score = self.score(squares)
         return RowFit(parameters, errors, weights, squares, score, factor, scales)
 
@@ -93,11 +101,11 @@ class Judge:
             parameters, *_ = _solution(training_rows, weights[~is_unseen])
             predictions = rows.columns[is_unseen] @ parameters
             errors[is_unseen] = rows.forces[is_unseen] - predictions
-        return self.mean_squares(errors * self.mask, rows.forces)
+        return self.mean_squares(errors * self.mask, rows)
 
-    def mean_squares(self, errors: np.ndarray, forces: np.ndarray) -> np.ndarray:
+    def mean_squares(self, errors: np.ndarray, rows: Rows) -> np.ndarray:
         """Return the mean squared error of each joint, not below the floor."""
-        floors = (ERROR_FLOOR**2) * np.mean(forces**2, axis=0) + 1e-300
+        floors = (ERROR_FLOOR * rows.force_sizes) ** 2
         return np.sum(errors**2, axis=0) / self._row_counts + floors
 
     def score(self, squares: np.ndarray) -> float:
@@ -130,7 +138,7 @@ def promise(judge: Judge, rows: Rows, fit: RowFit, columns: np.ndarray) -> float
     """Return by how much more columns [rows, joints, columns] would lower the score."""
     weights = judge.mask * fit.weights
     vectors = _flat(columns * weights[..., None])
-    remainders = vectors - _imitations(rows, weights, fit, vectors)
+    remainders = vectors - imitations(rows, weights, fit, vectors)
     # What the fit can imitate tells nothing.
     remainder_squares = np.sum(remainders**2, axis=0)
     column_squares = np.sum(vectors**2, axis=0)
@@ -139,11 +147,11 @@ def promise(judge: Judge, rows: Rows, fit: RowFit, columns: np.ndarray) -> float
     errors = (fit.errors * weights).ravel()
     amounts, *_ = np.linalg.lstsq(remainders, errors, rcond=1e-6)
     remaining_errors = (errors - remainders @ amounts).reshape(rows.forces.shape)
-    squares = judge.mean_squares(remaining_errors / fit.weights, rows.forces)
+    squares = judge.mean_squares(remaining_errors / fit.weights, rows)
     return fit.score - judge.score(squares)
 
 
-def _imitations(
+def imitations(
     rows: Rows, weights: np.ndarray, fit: RowFit, vectors: np.ndarray
 ) -> np.ndarray:
     """Return what the columns of a fit explain of weighted vectors [:, columns]."""

@@ -48,10 +48,12 @@ class Suspect(NamedTuple):
     Attributes:
         sentence: What seems to be wrong, with the key that mends it.
         rows: Rows of the log if it is so.
+        is_gain: Whether it is the gain of a joint's force.
     """
 
     sentence: str
     rows: Callable[[], Rows]
+    is_gain: bool = False
 
 
 class Quantity(NamedTuple):
@@ -164,6 +166,12 @@ class SuspectedMistakes:
 
         return Suspect(sentence, rows)
 
+    def rows_of_signs(self, angle_signs: np.ndarray, force_signs: np.ndarray) -> Rows:
+        """Return the rows with other signs of the columns [joints], +1 or -1."""
+        motion = self._combined_motion(np.diag(angle_signs))
+        forces = self._combined_forces(np.diag(force_signs))
+        return self._log.with_motion_and_forces(motion, forces)
+
     def _signs(self) -> Iterator[Suspect]:
         for j in self._joints:
             signs = np.diag(1 - 2 * self._identity[j])
@@ -248,6 +256,7 @@ class SuspectedMistakes:
                 for multiple, text in UNIT_TEXTS.items():
                     scales = np.where(turning, multiple * factor, 1.0)
                     yield text.format(unit), scales
+            yield from self._joints_in_degrees()
         if not turning.all():
             sentence = "the coordinates of sliding joints seem to be in mm"
             yield sentence, np.where(turning, 1.0, 1e-3)
@@ -261,6 +270,18 @@ class SuspectedMistakes:
             )
             for ratio in GEAR_RATIOS:
                 yield sentence, np.full(len(turning), 1 / ratio)
+
+    def _joints_in_degrees(self) -> Iterator[tuple[str, np.ndarray]]:
+        """Yield that one joint of several is in degrees, if it moves so far."""
+        if self._recording.angle_unit != "rad" or len(self._joints) == 1:
+            return
+        spans = np.ptp(self._log.log.motion.q, axis=0)
+        for j in np.flatnonzero(self._revolute & (spans > 2 * math.pi)):
+            sentence = (
+                f"the angle of joint {self._names[j]}, and not of all, seems to be in "
+                "deg (`recording.angle_unit` takes a list with a unit for each joint)"
+            )
+            yield sentence, np.where(self._identity[j] > 0, math.pi / 180, 1.0)
 
     def _sides(self) -> Iterator[Suspect]:
         """Yield that angles or forces are on the other side of the gears."""
@@ -365,7 +386,7 @@ class SuspectedMistakes:
         yield self._delay(tuple(self._joints))
         for j in self._joints:
             yield self._delay((j,))
-            yield self._gain(j)
+            yield self.gain(j)
             yield self._ratio(j)
             yield self._offset(j)
             for direction in range(3):
@@ -389,7 +410,9 @@ class SuspectedMistakes:
 
         return Quantity(sentence, rows, 2e-3, (-0.011, 0.1), 1e-3)
 
-    def _gain(self, joint: int) -> Quantity:
+    def gain(self, joint: int, center: float = 0.0) -> Quantity:
+        """Return the gain of a joint's force, about a logarithm."""
+
         def sentence(logarithm: float) -> str:
             return (
                 f"the force of joint {self._names[joint]} in the log seems to be "
@@ -402,7 +425,8 @@ class SuspectedMistakes:
             columns[:, joint] *= math.exp(logarithm)
             return self._log.rows._replace(columns=columns)
 
-        return Quantity(sentence, rows, 0.02, (-0.8, 0.8), 0.02, is_gain=True)
+        bounds = (center - 0.8, center + 0.8)
+        return Quantity(sentence, rows, 0.02, bounds, 0.02, is_gain=True)
 
     def _ratio(self, joint: int) -> Quantity:
         motion = self._log.log.motion
