@@ -1,10 +1,9 @@
 """Search for the mistake that explains most of what a model misses."""
 
 from collections.abc import Iterable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-import scipy
 
 from jaxid.dynamics.model import Model
 from jaxid.identification.delay import Delay
@@ -24,8 +23,14 @@ from .odd_joint import (
     odd_joint,
     odd_joint_text,
 )
+from .quantity_search import (
+    SCREENED_PROMISE,
+    Trial,
+    best_amount,
+    searched_quantities,
+)
 from .rest import rest_remarks
-from .row_fits import RowFit, Rows, promise
+from .row_fits import RowFit, Rows
 from .several_signs import several_signs, signs_text
 from .suspects import UNIT_START, Quantity, Suspect, SuspectedMistakes
 
@@ -56,13 +61,10 @@ class Gains(NamedTuple):
     possible_rest: float = 0.9  # of what is missed, and less than `MAX_CURED_MISFIT`
     contact: float = 1.3
     concentration: float = 11.5  # errors inside a contact, over those outside
-    screened: float = 0.03  # promise of a column, from which its amount is searched
     equal: float = 0.9  # share of the largest fall, from which mistakes are equal
 
 
 GAINS = Gains()
-MAX_SEARCHED = 12
-"""Number of quantities that are searched, the most promising ones."""
 MAX_VALIDATED = 8
 """Number of mistakes that are tried on parts that the fit has not seen."""
 MAX_EQUAL = 3
@@ -314,7 +316,7 @@ def _large_gains(
     if odd is None or center is None:
         return []
     quantity = suspected.gain(odd.joint, center)
-    amount = _best_amount(described_log, quantity)
+    amount = best_amount(described_log, quantity)
     return [
         Suspect(quantity.sentence(amount), lambda: quantity.rows(amount), is_gain=True)
     ]
@@ -413,15 +415,6 @@ def _misfit_text(described_log: DescribedLog, fit: RowFit) -> str:
     )
 
 
-class _Trial(NamedTuple):
-    """Rows under a mistake, and the fall of the score in the fit."""
-
-    gain: float
-    sentence: str
-    rows: Rows
-    is_gain: bool = False
-
-
 def explanations(
     described_log: DescribedLog,
     suspects: Iterable[Suspect],
@@ -436,14 +429,14 @@ def explanations(
         suspect_rows = suspect.rows()
         gain = score - judge.fit(suspect_rows).score
         is_gain = suspect.is_gain
-        trials.append(_Trial(gain, suspect.sentence, suspect_rows, is_gain))
-    trials += _searched_quantities(described_log, list(quantities))
+        trials.append(Trial(gain, suspect.sentence, suspect_rows, is_gain))
+    trials += searched_quantities(described_log, list(quantities))
     trials.sort(key=lambda trial: -trial.gain)
 
     unseen_squares = judge.unseen_squares(rows)
     results = []
     for trial in trials[:MAX_VALIDATED]:
-        if trial.gain > GAINS.screened:
+        if trial.gain > SCREENED_PROMISE:
             trial_squares = judge.unseen_squares(trial.rows)
             unseen_gain = judge.score(unseen_squares) - judge.score(trial_squares)
             remainders = np.sqrt(trial_squares / unseen_squares)[judge.is_judged]
@@ -458,70 +451,3 @@ def explanations(
             )
             results.append(explanation)
     return sorted(results, key=lambda result: -result.gain)
-
-
-def _searched_quantities(
-    described_log: DescribedLog, quantities: Sequence[Quantity]
-) -> list[_Trial]:
-    """Return the best amounts of the most promising quantities."""
-    judge = described_log.judge
-    rows = described_log.rows
-    fit = judge.fit(rows)
-    # Weights from the errors of a spoilt log may hide its mistake: those from the
-    # forces are tried, too.
-    fits = fit, judge.weighted_fit(rows, judge.force_weights(rows))
-    promises = [_promise(described_log, quantity, fits) for quantity in quantities]
-    order = np.argsort(promises)[::-1][:MAX_SEARCHED]
-    trials = []
-    for k in order:
-        if promises[k] > GAINS.screened:
-            quantity = quantities[k]
-            amount = _best_amount(described_log, quantity)
-            if _is_plausible(quantity, amount):
-                trial_rows = quantity.rows(amount)
-                gain = fit.score - judge.fit(trial_rows).score
-                sentence = quantity.sentence(amount)
-                trials.append(_Trial(gain, sentence, trial_rows, quantity.is_gain))
-    return trials
-
-
-def _promise(
-    described_log: DescribedLog, quantity: Quantity, fits: Sequence[RowFit]
-) -> float:
-    """Return the fall of the score that a small amount promises."""
-    step = quantity.step
-    higher_rows = quantity.rows(step)
-    lower_rows = quantity.rows(-step)
-    columns = (higher_rows.columns - lower_rows.columns) / (2 * step)
-    forces = (higher_rows.forces - lower_rows.forces) / (2 * step)
-    gains = []
-    for fit in fits:
-        column = (columns @ fit.parameters - forces)[..., None]
-        gains.append(promise(described_log.judge, described_log.rows, fit, column))
-    return max(gains)
-
-
-def _is_plausible(quantity: Quantity, amount: float) -> bool:
-    """Return whether an amount matters and lies within the bounds, not at them."""
-    lower, upper = quantity.bounds
-    margin = 0.02 * (upper - lower)
-    is_inside = lower + margin < amount < upper - margin
-    return is_inside and abs(amount) > quantity.min_amount
-
-
-def _best_amount(described_log: DescribedLog, quantity: Quantity) -> float:
-    """Return the amount that leaves least."""
-
-    def score(amount: float) -> float:
-        return described_log.judge.fit(quantity.rows(amount)).score
-
-    lower, upper = quantity.bounds
-    grid = np.linspace(lower, upper, 9)
-    scores = [score(amount) for amount in grid]
-    best = int(np.argmin(scores))
-    bracket = grid[max(best - 1, 0)], grid[min(best + 1, len(grid) - 1)]
-    options = {"maxiter": 12, "xatol": 0.02 * quantity.step}
-    result: Any = scipy.optimize.minimize_scalar(
-        score, bounds=bracket, method="bounded", options=options
-    )
-    return float(result.x) if result.fun < scores[best] else float(grid[best])

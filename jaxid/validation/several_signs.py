@@ -19,8 +19,8 @@ class Signs(NamedTuple):
     """Signs of the columns of a log, +1 or -1.
 
     Attributes:
-        angles: Of the angles [joints].
-        forces: Of the forces [joints].
+        angles: Signs of the angles [joints].
+        forces: Signs of the forces [joints].
     """
 
     angles: np.ndarray
