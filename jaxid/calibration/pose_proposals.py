@@ -22,7 +22,7 @@ POSTURE_SPREAD = 0.25
 """Deviation of proposed poses from the posture of their session, in half ranges."""
 MAX_ERROR = 1e-6
 """Largest error of a pose that reaches its place [m]."""
-SPARE_POSES = 2
+SPARE_POSES = 20
 """Random poses for each that is asked; not all can be taken."""
 
 
@@ -62,11 +62,22 @@ def propose_sessions(
         InputError: If no place can be reached in so many postures.
     """
     rng = np.random.default_rng(seed)
-    drafts = []
-    for _ in range(candidates):
-        problem = _reachable_session(fit, poses, rng, clearance)
-        if len(problem.poses.q) == poses:
-            drafts.append(problem)
+    middle, half_range = _middle_and_half_range(fit)
+    shape = (SPARE_POSES * poses, fit.robot.joints)
+    shares = rng.uniform(-1.0, 1.0, (candidates * shape[0], shape[1]))
+    postures = _possible_poses(fit, middle + half_range * shares, clearance)
+    sessions_of_poses = np.split(postures, range(poses, len(postures), poses))
+    if _is_contact(fit):
+        sessions_of_poses = []
+        for posture in postures[:candidates]:
+            spread = POSTURE_SPREAD * half_range * rng.normal(size=shape)
+            q = _touching_poses(_session_at(fit, posture, posture + spread))
+            sessions_of_poses.append(_possible_poses(fit, q, clearance)[:poses])
+    drafts = [
+        _session_at(fit, q[0], q)
+        for q in sessions_of_poses[:candidates]
+        if len(q) == poses
+    ]
     if not drafts:
         raise InputError(
             f"no place was found that the tool can reach in {poses} postures: ask for "
@@ -104,39 +115,36 @@ def _best_sessions(
     return best_sessions
 
 
-def _reachable_session(
-    fit: GeometryFit,
-    poses: int,
-    rng: np.random.Generator,
-    clearance: Clearance | None,
-) -> CalibrationProblem:
-    """Return a session of poses around a random posture that the robot can take."""
-    robot = fit.robot
-    limits = complete_limits(robot)
+def _middle_and_half_range(fit: GeometryFit) -> tuple[Vector, Vector]:
+    """Return the middles of the joints' ranges, and half of these."""
+    limits = complete_limits(fit.robot)
     low = np.asarray(limits.position_min)
     high = np.asarray(limits.position_max)
-    middle = 0.5 * (high + low)
-    half_range = 0.5 * (high - low)
-    posture = middle + 0.8 * half_range * rng.uniform(-1.0, 1.0, robot.joints)
-    shape = (SPARE_POSES * poses, robot.joints)
-    q = posture + POSTURE_SPREAD * half_range * rng.normal(size=shape)
-    problem = _session_at(fit, posture, q)
+    return 0.5 * (high + low), 0.5 * (high - low)
+
+
+def _possible_poses(
+    fit: GeometryFit, q: np.ndarray, clearance: Clearance | None
+) -> np.ndarray:
+    """Return the poses within the limits of the joints that keep a distance."""
+    middle, half_range = _middle_and_half_range(fit)
+    q = q[np.all(np.abs(q - middle) <= half_range, axis=1)]
+    if clearance is None or not len(q):
+        return q
+    rest = np.zeros_like(q)
+    # Shapes belong to the nominal frames of the bodies.
+    with double_precision():
+        excess = clearance(fit.problem.robot, Motion(q, rest, rest))
+    excess = np.asarray(excess)
+    return q[excess.max(axis=1) <= 0.0]
+
+
+def _touching_poses(problem: CalibrationProblem) -> np.ndarray:
+    """Return poses near those of a problem in which the tool is in its place."""
     nominal = problem.nominal.vector
-    if _is_contact(fit):
-        problem = problem.without_errors(nominal)
-        errors = problem.error_sizes(problem.pose_errors(nominal).values)
-        is_possible = errors.lengths < MAX_ERROR
-    else:
-        is_possible = np.ones(len(q), bool)
-    q = problem.poses.q
-    is_possible &= np.all(np.abs(q - middle) <= half_range, axis=1)
-    if clearance is not None:
-        rest = np.zeros_like(q)
-        with double_precision():
-            excess = np.asarray(clearance(robot, Motion(q, rest, rest)))
-        is_possible &= excess.max(axis=1) <= 0.0
-    best = q[is_possible][:poses]
-    return _session_at(fit, posture, best)
+    exact = problem.without_errors(nominal)
+    errors = exact.error_sizes(exact.pose_errors(nominal).values)
+    return exact.poses.q[errors.lengths < MAX_ERROR]
 
 
 def _is_contact(fit: GeometryFit) -> bool:

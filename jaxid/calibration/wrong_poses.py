@@ -7,7 +7,7 @@ import scipy
 
 from jaxid.arrays import Vector
 
-from .adjustment import Weights, adjust
+from .adjustment import SessionEquations, Weights, adjust, normal_matrices
 from .problem import CalibrationProblem
 
 ROBUST_STEPS = 8
@@ -24,6 +24,7 @@ class ErrorLimits(NamedTuple):
     half_weight: float = 3.0
     wrong: float = 3.8
     min_typical_size: float = 0.1  # in units of the stated deviation
+    min_share_left: float = 0.1  # of the squares of errors
     max_share: float = 0.5  # of the poses of a session; with more it disagrees itself
 
 
@@ -40,6 +41,29 @@ def pose_sizes(errors: np.ndarray, deviations: np.ndarray) -> np.ndarray:
     counts = np.isfinite(deviations).sum(axis=1)
     squares = np.sum(errors**2, axis=-1)
     return np.sqrt(squares / scipy.special.chdtri(counts, 0.5))
+
+
+def share_of_errors_left(
+    problem: CalibrationProblem,
+    equations: list[SessionEquations],
+    scales: Vector,
+    session_weights: Vector,
+) -> float:
+    """Return the share of noise that remains as errors, of squares.
+
+    It is the share of the measured numbers that no unknown uses up. Those that the
+    prior decides use up a part.
+    """
+    units = scales[problem.common_columns]
+    matrix = np.tensordot(session_weights, normal_matrices(equations), 1)
+    scaled_matrix = units[:, None] * matrix * units
+    system = scaled_matrix + np.eye(len(units))
+    count = np.trace(np.linalg.solve(system, scaled_matrix))
+    is_used = session_weights > 0.0
+    for session in np.flatnonzero(is_used):
+        count += np.count_nonzero(scales[problem.session_columns[session]])
+    is_measured = np.isfinite(problem.poses.deviations[is_used[problem.poses.session]])
+    return max(1.0 - count / is_measured.sum(), LIMITS.min_share_left)
 
 
 def find_wrong_poses(
@@ -65,7 +89,11 @@ def find_wrong_poses(
         if number < EQUAL_STEPS:
             continue
         sizes = pose_sizes(end.linearisation.errors, problem.poses.deviations)
-        typical_size = max(np.median(sizes[is_used]), LIMITS.min_typical_size)
+        # With more unknowns, errors of poses are smaller, and of those that are left
+        # out larger.
+        left = share_of_errors_left(problem, end.equations, scales, session_weights)
+        typical_size = np.median(sizes[is_used]) / left
+        typical_size = max(typical_size, LIMITS.min_typical_size)
         relative_sizes = np.where(is_used, sizes / typical_size, 0.0)
         weights = 1.0 / (1.0 + (relative_sizes / LIMITS.half_weight) ** 2) ** 2
     is_wrong = np.greater(relative_sizes, LIMITS.wrong)
