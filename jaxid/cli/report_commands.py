@@ -19,7 +19,6 @@ EXPORTS = {
     "urdf": "arm.urdf",
     "mjcf": "arm.xml",
     "json": "arm.json",
-    "pinocchio": "arm_pinocchio.json",
     "jax": "arm.jax",
 }
 """Formats of `jaxid export`, and the file where none is named."""
@@ -30,7 +29,7 @@ def export(
         Path, typer.Argument(help="Report, or a model file (.json).", metavar="REPORT")
     ],
     to: Annotated[
-        Literal["c", "urdf", "mjcf", "json", "pinocchio", "jax"],
+        Literal["c", "urdf", "mjcf", "json", "jax"],
         typer.Option("--to", help="What to write."),
     ],
     output: Annotated[
@@ -50,7 +49,7 @@ def export(
     ] = False,
     force: options.Force = False,
 ) -> None:
-    """Write a model as C, URDF, MJCF, JSON, vectors or JAX.
+    """Write a model as C, URDF, MJCF, JSON or JAX.
 
     C is a feed-forward for controllers: one file and its header, named like the output.
     """
@@ -79,8 +78,6 @@ def export(
         case "mjcf":
             jid.export_mjcf(fit, path)
             show_omissions(console, path, fit, holds_rotors=True)
-        case "pinocchio":
-            jid.export.export_pinocchio(fit, path)
         case "jax":
             jid.export.export_jax(fit, path)
         case "json":

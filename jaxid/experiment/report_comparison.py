@@ -10,6 +10,7 @@ from jaxid.identification.parameter_changes import Comparison, compare
 from jaxid.report.comparison_page import ComparisonReport
 from jaxid.report.result_files import read_fit, read_result
 from jaxid.report.result_records import Record
+from jaxid.result_table import Remark, Status
 from jaxid.validation.torque_errors import TorqueErrors, torque_errors
 from jaxid.workflow.log_loading import load_logs, select_filter
 from jaxid.workflow.setup import Progress, ignore_progress
@@ -79,7 +80,7 @@ def data_doubts(
     fits: Sequence[Fit],
     comparison: Comparison | None,
     log: Path | None,
-) -> list[str]:
+) -> list[Remark]:
     """Return which logs both reports were made of, and which reports saw the log."""
     logs = [x.get("settings", {}).get("identification", ()) for x in results]
     places = [{Path(name).resolve() for name in names} for names in logs]
@@ -98,4 +99,4 @@ def data_doubts(
                 f"`{fit.name}` was fitted to `{log.name}`, or to a part of it: compare "
                 "on another log"
             )
-    return doubts
+    return [Remark(text, Status.DOUBTFUL) for text in doubts]

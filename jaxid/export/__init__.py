@@ -11,7 +11,6 @@ from .jax_function import (
 from .mujoco_model import as_mujoco as as_mujoco, export_mjcf as export_mjcf
 from .pinocchio_model import (
     as_pinocchio as as_pinocchio,
-    export_pinocchio as export_pinocchio,
     pinocchio_parameters as pinocchio_parameters,
 )
 from .servo_actuators import (

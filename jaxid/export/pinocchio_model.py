@@ -1,13 +1,12 @@
-"""The identified model for Pinocchio: its own `Model`, and a file of parameters."""
+"""The identified model for Pinocchio: its own `Model`, or parameters of bodies."""
 
-from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit
-from jaxid.io import FilePath, import_extra, json_text, write_text
+from jaxid.io import import_extra
 from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.robot import Robot
 
@@ -95,33 +94,3 @@ def _depth_first_order(robot: Robot) -> list[int]:
         children = [i for i in robot.order if robot.parent[i] == joint]
         waiting_joints += children[::-1]
     return order
-
-
-def export_pinocchio(fit: Fit, path: FilePath) -> Path:
-    """Write the bodies in Pinocchio's order, and the joints' dynamics, as JSON.
-
-    Args:
-        fit: Identified model.
-        path: Path of the file; an existing file is replaced.
-    """
-    dynamics = joint_dynamics(fit)
-    rows = pinocchio_parameters(fit).tolist()
-    joints = []
-    robot = fit.base.model.robot
-    # Friction of followers is part of their leaders'.
-    zeros = np.zeros(len(robot.followers))
-    for i, name in enumerate(robot.body_names):
-        joint_values = {
-            key: float(np.append(values, zeros)[i])
-            for key, values in dynamics.values.items()
-        }
-        joints.append({"name": name, "parameters": rows[i], **joint_values})
-    content = {
-        "model": fit.checksum,
-        "date": fit.date,
-        "names": ["m", "mx", "my", "mz", "Ixx", "Ixy", "Iyy", "Ixz", "Iyz", "Izz"],
-        "joints": joints,
-        "left_out": list(dynamics.omissions),
-    }
-    write_text(path, json_text(content))
-    return Path(path)

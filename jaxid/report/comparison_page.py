@@ -31,14 +31,14 @@ class ComparisonReport(Summarised):
         robot: The robot.
         comparison: Parameters of the fits; None if the models have different ones.
         errors: Torque errors of both on one log, by name; empty without a log.
-        doubts: What the data of the fits have in common, as sentences.
+        doubts: What the data of the fits have in common.
         settings: Origin of the result, as `provenance` takes it.
     """
 
     robot: Robot
     comparison: Comparison | None
     errors: Mapping[str, TorqueErrors]
-    doubts: Sequence[str]
+    doubts: Sequence[Remark]
     settings: Settings = dataclasses.field(default_factory=dict)
 
     @property
@@ -67,11 +67,6 @@ class ComparisonReport(Summarised):
             numbers.append((count, "parameters have changed"))
         return numbers
 
-    @property
-    def remarks(self) -> list[Remark]:
-        """Doubts, as remarks."""
-        return [Remark(text, Status.DOUBTFUL) for text in self.doubts]
-
     def error_table(self) -> Table:
         """Return the errors on the log, joint by joint."""
         columns = [
@@ -84,16 +79,13 @@ class ComparisonReport(Summarised):
     def overview(self) -> list[Table]:
         """Return errors on the log, what has changed, doubts and verdict."""
         changes = [] if self.comparison is None else self.comparison.overview()[1:]
-        return self._with_errors(changes)
+        errors = [self.error_table()] if self.errors else []
+        return [*errors, *changes, Table("", remarks=[*self.doubts, self.verdict])]
 
     def tables(self) -> list[Table]:
-        """Return errors on the log, all parameters, doubts and verdict."""
-        return self._with_errors(self.comparison.tables() if self.comparison else [])
-
-    def _with_errors(self, tables: Sequence[Table]) -> list[Table]:
-        """Return tables with the errors before them, doubts and verdict behind."""
-        errors = [self.error_table()] if self.errors else []
-        return [*errors, *tables, Table("", remarks=[*self.remarks, self.verdict])]
+        """Return all parameters, then the overview."""
+        parameters = [] if self.comparison is None else self.comparison.tables()[:1]
+        return [*parameters, *self.overview()]
 
     def save(self, folder: FilePath) -> list[Path]:
         """Write a page, and the numbers as JSON and CSV; return the files."""
@@ -108,7 +100,7 @@ class ComparisonReport(Summarised):
         glance = [
             self.verdict,
             tiles(*self.numbers),
-            self.remarks,
+            self.doubts,
         ]
         sections: list[Section] = [("At a glance", glance)]
         if records:

@@ -132,14 +132,15 @@ def pose_figure(
             leader = follower.leader
             columns.append(largest if leader is None else values[:, [leader]])
         values = np.concatenate(columns, axis=1)
-    points = _points(robot, q[rows])
+    places = _body_places(robot, q[rows])
+    points = places[..., 3]
     solid_clouds = list(clouds)
     if shapes is not None:
         reach = float(np.linalg.norm(points, axis=2).max())
         solid_clouds += _collision_clouds(shapes, PLANE_SIZE * reach)
     solids = None
     if solid_clouds:
-        solids = _solids(solid_clouds, _body_places(robot, q[rows[frames]]))
+        solids = _solids(solid_clouds, places[frames, :-1])
     scene = Scene(
         time=time[rows],
         points=points,
@@ -204,23 +205,17 @@ def even_indices(count: int, max_count: int) -> np.ndarray:
     return np.unique(places.round().astype(int))
 
 
-def _points(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """Return the origins of all bodies, and the end-effector [m]."""
-
-    def points(sample):
-        _, origins = placements(robot, sample)
-        _, tip = tip_placement(robot, sample)
-        return jnp.concatenate([origins, tip[None]])
-
-    with double_precision():
-        return in_numpy(robot, points, q)
-
-
 def _body_places(robot: Robot, q: np.ndarray) -> np.ndarray:
-    """Return rotation and origin of each body as [R r], (samples, bodies, 3, 4)."""
+    """Return rotation and origin of each body and the tip as [R r].
+
+    The axes are samples, bodies and the tip, 3, 4.
+    """
 
     def body_places(sample):
         rotations, origins = placements(robot, sample)
+        rotation, tip = tip_placement(robot, sample)
+        rotations = jnp.concatenate([rotations, rotation[None]])
+        origins = jnp.concatenate([origins, tip[None]])
         return jnp.concatenate([rotations, origins[:, :, None]], axis=2)
 
     with double_precision():

@@ -91,10 +91,11 @@ def require_positive(filter: AbstractFilter, *names: str) -> None:
         require(filter, name, lambda x: x > 0, "positive")
 
 
-def require_order(filter: AbstractFilter, min_order: int = 1) -> None:
+def require_order(filter: AbstractFilter) -> None:
     """Refuse an order that no filter has in practice."""
-    words = f"between {min_order} and 20 (2 to 8 are usual)"
-    require(filter, "order", lambda x: min_order <= x <= 20, words)
+    require(
+        filter, "order", lambda x: 1 <= x <= 20, "between 1 and 20 (2 to 8 are usual)"
+    )
 
 
 def require(
