@@ -16,7 +16,7 @@ from jaxid.errors import InputError
 from jaxid.excitation.criteria import CRITERIA
 from jaxid.experiment.decoder import keys_of, table_of
 from jaxid.experiment.experiment import TABLES, load_experiment
-from jaxid.experiment.setup_tables import KINDS, SIDES
+from jaxid.experiment.setup_tables import KINDS
 from jaxid.experiment.template import write_template
 from jaxid.experiment_file import KEYS
 from jaxid.experiment_values import decode_table
@@ -583,6 +583,16 @@ def test_every_commented_key_of_the_template_is_a_known_one(tmp_path):
         )
         for name, table in content.items():
             decode_table(table, KEYS[name], name)
+
+
+SIDES = (
+    "angles_on_motor_side",
+    "forces_on_motor_side",
+    "joint_names",
+    "wrench",
+    "wrench_sign",
+)
+"""Arguments of `Columns` that `side`, `forces_side`, robot and `[sensor]` tell."""
 
 
 def keys_by_table(name, functions):

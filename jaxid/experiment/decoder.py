@@ -10,7 +10,7 @@ import dataclasses
 import inspect
 import re
 import typing
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated, Any
 
 from jaxid.errors import InputError
@@ -50,18 +50,14 @@ def decode(
     place: str,
     *,
     complete: bool = True,
-    skip: Iterable[str] = (),
 ) -> list[TomlTable]:
     """Return a table's arguments for each of several functions that share it.
 
-    Arguments in `skip` are no keys; keys without default are needed where the table is
-    `complete`.
+    Keys without default are needed where the table is `complete`.
     """
     keys: Keys = {}
     for function in functions:
         keys |= keys_of(function)
-    for name in skip:
-        keys.pop(name, None)
     check_names(table, list(keys), place)
     if complete:
         _require_keys(keys, table, place)

@@ -215,16 +215,6 @@ class Sides:
         }
 
 
-SIDES = (
-    "angles_on_motor_side",
-    "forces_on_motor_side",
-    "joint_names",
-    "wrench",
-    "wrench_sign",
-)
-"""Arguments of `Columns` that `side`, `forces_side`, robot and `[sensor]` tell."""
-
-
 def build_columns(
     table: TomlTable, robot: Robot, folder: Path, wrench: Selection | None = None
 ):
@@ -233,9 +223,7 @@ def build_columns(
     With the columns of a `wrench`, forces of the joints may be missing.
     """
     table = {key: with_joint_names(value, robot) for key, value in table.items()}
-    arguments, sides, reading = decode(
-        [Columns, Sides, LogReading], table, "recording", skip=SIDES
-    )
+    arguments, sides, reading = decode([Columns, Sides, LogReading], table, "recording")
     if "forces" not in arguments:
         if wrench is None and "commands" not in arguments:
             raise InputError("`recording.forces` is missing: `[recording]` needs it.")
@@ -333,24 +321,15 @@ def build_rows(
     return filters.Subsample(step or 1), speeds
 
 
-KEYS_OF_SETTINGS: dict[str, Texts] = {
-    "weights": ("weights",),
-    "solution": ("ridge",),
-    "bounds": tuple(keys_of(BodyBounds)),
-    "pull": ("pull",),
-}
-"""Keys from which each setting of an estimator is made."""
-
-
-def keys_of_kind(kind: str) -> Texts:
-    """Return the keys of one kind of estimator, apart from those of all kinds."""
-    settings = inspect.signature(ESTIMATORS[kind]).parameters
-    keys = [key for name in settings for key in KEYS_OF_SETTINGS.get(name, ())]
-    return tuple(keys)
-
-
+KEYS_OF_ROWS = ("weights", "ridge")
 # Instrumental variables need a motion, which a file cannot hold.
-KINDS = {kind: keys_of_kind(kind) for kind in ESTIMATORS if kind != "instrumental"}
+KINDS: dict[str, Texts] = {
+    "weighted": KEYS_OF_ROWS,
+    "least_squares": ("ridge",),
+    "huber": KEYS_OF_ROWS,
+    "tukey": KEYS_OF_ROWS,
+    "consistent": ("weights", "pull", *keys_of(BodyBounds)),
+}
 """Keys of each kind of estimator; others are for all kinds."""
 
 
