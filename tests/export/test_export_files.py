@@ -323,7 +323,8 @@ def test_pinocchio_gets_a_tree_whose_branches_are_mixed():
     # Joint 4 belongs to the branch of joint 2: Pinocchio wants it before joint 3.
     parents, turns = (-1, 0, 0, 1, 2), (True, True, True, True, False)
     tree = trees.Tree(parents, turns, *trees.geometry(rng, 5), rng.normal(size=3) * 9)
-    limits = jid.Limits(5, position_max=[0.5, 1.0, 1.5, 2.0, 2.5])
+    ends = [0.5, 1.0, 1.5, 2.0, 2.5]
+    limits = jid.Limits(5, position_min=np.negative(ends), position_max=ends)
     model = jid.Model(tree.robot(limits=limits))
     fit, m = fit_of(model, possible(model), full=True), motion(5, 20)
     theirs = jid.as_pinocchio(fit)
