@@ -12,7 +12,7 @@ if TYPE_CHECKING:
     from .geometry_fit import GeometryFit
 
 MAX_EXAMPLES = 5
-"""Number of poses that a sentence names."""
+"""Number of poses or places that a sentence names."""
 MIN_POSES = 10
 """Number of different poses of a place below which it tells little."""
 POSE_DECIMALS = 2
@@ -28,6 +28,7 @@ class FindingLimits(NamedTuple):
     shift: float = 0.01  # of an origin [m]
     turn: float = 0.05  # of an origin [rad]
     improvement: float = 0.8  # held-out errors over nominal ones
+    share_of_reach: float = 0.005  # held-out errors over the robot's reach
 
 
 LIMITS = FindingLimits()
@@ -60,11 +61,16 @@ def _verdict(fit: "GeometryFit", findings: list[Remark]) -> Remark:
     before = 1e3 * fit.mean_error(fit.held_out.nominal)
     after = 1e3 * fit.mean_error(fit.held_out.calibrated)
     numbers = f"from {significant(before)} to {significant(after)} mm"
+    comparison = ""
+    if after > 1e3 * LIMITS.share_of_reach * fit.problem.reach:
+        comparison = "not that of this robot"
     if after > LIMITS.improvement * before:
+        comparison = "hardly better than the nominal one"
+    if comparison:
         text = (
-            "The calibrated geometry is hardly better than the nominal one: on "
-            f"sessions held out in turn, the mean error changes {numbers}; do not use "
-            "it, and check joint coordinates, units and the robot's file"
+            f"The calibrated geometry is {comparison}: on sessions held out in turn, "
+            f"the mean error changes {numbers}; do not use it, and check joint "
+            "coordinates, units and the robot's file"
         )
         return Remark(text, Status.BAD)
     text = f"On sessions held out in turn, the mean error falls {numbers}"
@@ -87,15 +93,21 @@ def _on_search(fit: "GeometryFit") -> Iterator[Remark]:
 
 def _on_few_poses(fit: "GeometryFit") -> Iterator[Remark]:
     """Yield a finding on places with few different poses."""
-    for (session, place), rows in fit.problem.poses_of_places.items():
-        q = fit.problem.poses.q[rows]
-        count = len(np.unique(np.round(q, POSE_DECIMALS), axis=0))
+    poses = fit.problem.poses
+    counts = {}
+    for place in np.unique(poses.place[poses.is_pose]):
+        rows = poses.is_pose & (poses.place == place)
+        q = np.round(poses.q[rows], POSE_DECIMALS)
+        count = len(np.unique(q, axis=0))
         if count < MIN_POSES:
-            yield Remark(
-                f"Session `{session}` has {count} different poses of `{place}`: record "
-                "20 to 30",
-                Status.DOUBTFUL,
-            )
+            counts[" ".join(fit.problem.frame_keys[place]).strip()] = count
+    if counts:
+        examples = [f"{name} ({count})" for name, count in counts.items()]
+        yield Remark(
+            f"Places with few different poses: {', '.join(examples[:MAX_EXAMPLES])}; "
+            "record 20 to 30 in each",
+            Status.DOUBTFUL,
+        )
 
 
 def _on_wrong_poses(fit: "GeometryFit") -> Iterator[Remark]:
@@ -124,11 +136,17 @@ def _on_corrections(fit: "GeometryFit") -> Iterator[Remark]:
     """Yield findings on corrections and compliances that no robot should have."""
     sizes = np.abs(fit.origins)
     is_large = (sizes[:, :3] > LIMITS.shift) | (sizes[:, 3:] > LIMITS.turn)
-    names = np.array(fit.problem.robot.body_names)[is_large.any(axis=1)]
-    if len(names):
+    joints = [
+        f"{fit.problem.robot.body_names[joint]} "
+        f"({significant(1e3 * sizes[joint, :3].max(), 2)} mm, "
+        f"{significant(1e3 * sizes[joint, 3:].max(), 2)} mrad)"
+        for joint in np.flatnonzero(is_large.any(axis=1))
+    ]
+    if joints:
         yield Remark(
-            f"The corrections of {', '.join(names)} are larger than manufacturing "
-            "errors: is it the file of this robot, and are these its coordinates?",
+            f"The corrections of {', '.join(joints)} are larger than manufacturing "
+            "errors: is it the file of this robot, and are the zeros of these joints "
+            "right?",
             Status.DOUBTFUL,
         )
     values = fit.combinations.of(fit.values)
@@ -149,13 +167,14 @@ def _on_held_out_sessions(fit: "GeometryFit") -> Iterator[Remark]:
         return
     errors = fit.held_out.calibrated.lengths
     poses = fit.problem.poses_of_sessions
-    means = np.array([errors[x].mean() for x in poses])
-    limit = LIMITS.session_error * np.median(means)
-    for session in np.flatnonzero(means > limit):
+    # Single wrong poses are named anyway.
+    sizes = np.array([np.median(errors[x]) for x in poses])
+    limit = LIMITS.session_error * np.median(sizes)
+    for session in np.flatnonzero(sizes > limit):
         name = fit.problem.sessions[session]
         yield Remark(
-            f"Session `{name}` disagrees with the others: held out, its mean error is "
-            f"{significant(1e3 * means[session])} mm; was something loose?",
+            f"Session `{name}` disagrees with the others: held out, its typical error "
+            f"is {significant(1e3 * sizes[session])} mm; was something loose?",
             Status.DOUBTFUL,
         )
     yield from _on_known_distances(fit)

@@ -74,6 +74,12 @@ class CalibrationProblem:
         )
 
     @property
+    def reach(self) -> float:
+        """Length of the stretched robot, without joints that slide [m]."""
+        offsets = np.linalg.norm(self.robot.offset, axis=1)
+        return float(offsets.sum() + np.linalg.norm(self.robot.tip_offset))
+
+    @property
     def frame_scales(self) -> Vector:
         """Scales of unknowns that leave the geometry nominal."""
         return self.nominal._replace(frames=self.freedoms.astype(float)).vector

@@ -2,7 +2,8 @@
 
 import dataclasses
 import itertools
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
@@ -12,7 +13,7 @@ from jaxid.result_table import significant
 from jaxid.robot.robot import Robot
 
 from .adjustment import Weights, adjust
-from .observations import AbstractObservation
+from .observations import AbstractObservation, MeasuredPose
 from .problem import CalibrationProblem, build_problem
 
 SEARCH_STEPS = 10
@@ -22,8 +23,10 @@ SEARCH_STEPS = 10
 class MistakeLimits(NamedTuple):
     """When poses cannot be those of a robot, and when a mistake explains this."""
 
-    share_of_reach: float = 0.05  # typical error of the nominal robot
+    doubtful_share: float = 0.01  # typical error of the nominal robot, of its reach
+    wrong_share: float = 0.05
     left_by_mistake: float = 0.25  # typical error after its correction, relative
+    shown_error: float = 1.0  # of the search for tools and places, which may fail [m]
 
 
 LIMITS = MistakeLimits()
@@ -46,59 +49,72 @@ def require_right_robot(
 ) -> None:
     """Reject poses whose errors no calibration can remove, and name the mistake."""
     robot = problem.robot
-    offsets = np.linalg.norm(robot.offset, axis=1)
-    reach = float(offsets.sum() + np.linalg.norm(robot.tip_offset))
     error = typical_nominal_error(problem)
-    if error <= LIMITS.share_of_reach * reach:
+    if error <= LIMITS.doubtful_share * problem.reach:
         return
     errors = {}
-    for words, (matrix, factor) in _mistakes(robot):
-        others = [_without_mistake(x, matrix, factor) for x in observations]
+    for words, correct in _corrections(robot):
+        others = [correct(x) if x.has_poses else x for x in observations]
         errors[words] = typical_nominal_error(build_problem(robot, others, None))
     words = min(errors, key=lambda words: errors[words])
+    is_explained = errors[words] < LIMITS.left_by_mistake * error
+    if error <= LIMITS.wrong_share * problem.reach and not is_explained:
+        return
     cure = (
         "is it the file of this robot, and are order, signs, zeros and units of the "
         "joints right, and the unit of measured lengths?"
     )
-    if errors[words] < LIMITS.left_by_mistake * error:
+    if is_explained:
         left = significant(1e3 * errors[words])
         cure = f"{words}, it is {left} mm: correct this first."
+    size = f"{significant(1e3 * error)} mm"
+    if error > LIMITS.shown_error:
+        size = "more than a metre"
     raise InputError(
         f"`observations` are not poses of `{robot.name}`: with the best tools and "
-        f"places, their typical error is {significant(1e3 * error)} mm, far more than "
-        f"wrong lengths and zeros explain; {cure}"
+        f"places, their typical error is {size}, far more than wrong lengths and zeros "
+        f"explain; {cure}"
     )
 
 
-def _mistakes(robot: Robot) -> Iterator[tuple[str, tuple[np.ndarray, float]]]:
-    """Yield corrections of usual mistakes.
-
-    Each is a matrix from the right joint coordinates to the given ones, and a factor of
-    measured lengths.
-    """
+def _corrections(robot: Robot) -> Iterator[tuple[str, Callable]]:
+    """Yield corrections of usual mistakes in observations."""
     names = robot.joint_names
     identity = np.eye(robot.joints)
     for joint, name in enumerate(names):
         signs = identity.copy()
         signs[joint, joint] = -1.0
-        yield f"with the other sign of `{name}`", (signs, 1.0)
+        yield f"with the other sign of `{name}`", partial(_with_joints, signs)
     for joint, pair in enumerate(itertools.pairwise(names)):
         order = identity.copy()
         order[[joint, joint + 1]] = order[[joint + 1, joint]]
-        yield f"with `{pair[0]}` and `{pair[1]}` swapped", (order, 1.0)
-    yield "with the joints in the reverse order", (identity[::-1], 1.0)
-    degrees = np.where(robot.revolute, np.rad2deg(1.0), 1.0)
-    yield "with joint angles 57.3 times as large", (np.diag(degrees), 1.0)
-    yield "with measured lengths 1,000 times smaller", (identity, 1e-3)
-    yield "with measured lengths 1,000 times larger", (identity, 1e3)
+        yield f"with `{pair[0]}` and `{pair[1]}` swapped", partial(_with_joints, order)
+    backwards = partial(_with_joints, identity[::-1])
+    yield "with the joints in the reverse order", backwards
+    degrees = np.diag(np.where(robot.revolute, np.rad2deg(1.0), 1.0))
+    yield "with joint angles 57.3 times as large", partial(_with_joints, degrees)
+    yield "with measured lengths 1,000 times smaller", partial(_with_lengths, 1e-3)
+    yield "with measured lengths 1,000 times larger", partial(_with_lengths, 1e3)
+    yield "with each measured pose the other way round (`eye_in_hand`)", _inverted
 
 
-def _without_mistake(
-    observation: AbstractObservation, matrix: np.ndarray, factor: float
-) -> AbstractObservation:
-    """Return an observation with other joint coordinates and measured lengths."""
-    if not observation.has_poses:
-        return observation
+def _with_joints(matrix: np.ndarray, observation: AbstractObservation):
+    """Return an observation whose joint coordinates are multiplied by a matrix."""
+    return dataclasses.replace(observation, q=observation.q @ matrix)
+
+
+def _with_lengths(factor: float, observation: AbstractObservation):
+    """Return an observation whose measured lengths are multiplied by a factor."""
     lengths = {"positions", "distance"} & observation.measurements.keys()
     changes = {name: factor * getattr(observation, name) for name in lengths}
-    return dataclasses.replace(observation, q=observation.q @ matrix, **changes)
+    return dataclasses.replace(observation, **changes)
+
+
+def _inverted(observation: AbstractObservation):
+    """Return an observation whose measured poses, if it has some, are inverted."""
+    if not isinstance(observation, MeasuredPose):
+        return observation
+    pose = observation.measured.inverse
+    return dataclasses.replace(
+        observation, rotations=pose.rotation, positions=pose.position
+    )

@@ -196,7 +196,7 @@ def calibrate(
             sessions,
             content.calibration,
             progress,
-            content.surroundings.clearance,
+            lambda: content.surroundings.clearance,
             logs,
         )
     show_runs(console, detail, report, output, content.text)

@@ -1,7 +1,7 @@
 """Kinematic calibration from files: sessions become a report."""
 
 import dataclasses
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 
@@ -118,7 +118,7 @@ def calibrate_from_files(
     paths: Paths,
     settings: CalibrationSettings,
     progress: Progress = ignore_progress,
-    clearance: Clearance | None = None,
+    clearance: Callable[[], Clearance | None] = lambda: None,
     logs: TorqueLogs | None = None,
 ) -> "CalibrationReport":
     """Calibrate the geometry of a robot from the files of several sessions.
@@ -131,7 +131,8 @@ def calibrate_from_files(
         settings: Columns of the files, and what was measured.
         progress: Callback, called with a stage and its completed fraction (0 to 1) of
             all stages.
-        clearance: Distance that shapes keep in poses that are proposed.
+        clearance: Function that returns the distance that shapes keep in poses to
+            record, or None; called after the calibration.
         logs: Logs whose torques are compared with both geometries.
     """
     # Other commands do not wait for calibrations.
@@ -160,7 +161,7 @@ def calibrate_from_files(
     for file in files:
         sources.setdefault(file.session, []).append(file.path)
     units = settings.radians(setup.robot)
-    return calibration_report(fit, sources, clearance, units, findings)
+    return calibration_report(fit, sources, clearance(), units, findings)
 
 
 def compare_torques(setup: Setup, calibrated: Robot, logs: TorqueLogs) -> Remark:

@@ -1,5 +1,7 @@
 """The family of observations: each kind finds an arm that Pinocchio moves."""
 
+import dataclasses
+
 import numpy as np
 import pytest
 
@@ -160,6 +162,42 @@ def test_derivatives_of_a_tree_with_a_rail_and_a_follower():
         )
     # The body beside the chain does not move the end-effector.
     assert not jacobian[..., 18:24].any()
+
+
+def with_sign(x):
+    return dataclasses.replace(x, q=x.q * np.array([1, 1, 1, -1, 1, 1, 1]))
+
+
+def swapped(x):
+    return dataclasses.replace(x, q=x.q[:, [0, 2, 1, 3, 4, 5, 6]])
+
+
+def in_millimetres(x):
+    return dataclasses.replace(x, positions=1e3 * x.positions)
+
+
+def other_way_round(x):
+    pose = x.measured.inverse
+    return dataclasses.replace(x, rotations=pose.rotation, positions=pose.position)
+
+
+@pytest.mark.parametrize(
+    ("kind", "mistake", "words"),
+    [
+        ("point_contact", with_sign, "the other sign of `joint4`"),
+        ("plane_contact", swapped, "`joint2` and `joint3` swapped"),
+        ("measured_position", in_millimetres, "1,000 times smaller"),
+        ("measured_pose", other_way_round, "`eye_in_hand`"),
+        ("measured_position", lambda x: dataclasses.replace(x, q=x.q[::-1]), "zeros"),
+    ],
+)
+def test_mistakes_are_named(robot, arm, kind, mistake, words):
+    """Calibration is refused, and says what was probably wrong."""
+    rng = np.random.default_rng(0)
+    observations = [SIMULATED[kind](arm, robot, k, rng) for k in range(2)]
+    assert jid.calibrate(robot, observations, compliance=False)
+    with pytest.raises(jid.InputError, match=f"not poses of `Panda`.*{words}"):
+        jid.calibrate(robot, [mistake(x) for x in observations], compliance=False)
 
 
 @pytest.mark.parametrize(
