@@ -164,23 +164,17 @@ def namespace(*arrays: AnyArray) -> ModuleType:
     return jnp if any(isinstance(x, jax.Array) for x in arrays) else np
 
 
-def on_cores(
-    function: Callable[[Any], Any],
-    items: Iterable,
-    cores: int | None = None,
-    ahead: int | None = None,
-) -> Iterator[Any]:
+def on_cores(function: Callable[[Any], Any], items: Iterable) -> Iterator[Any]:
     """Yield a function's results for some items in their order, computed on all cores.
 
-    The calling thread makes the items, and at most `ahead` of them before it takes a
-    result: by default one for each core.
+    The calling thread makes the items, and at most one for each core before it takes a
+    result.
     """
-    cores = cores or os.cpu_count() or 1
-    ahead = ahead or cores
+    cores = os.cpu_count() or 1
     pending_results: deque[Future] = deque()
     with ThreadPoolExecutor(cores) as pool:
         for item in items:
-            if len(pending_results) >= ahead:
+            if len(pending_results) >= cores:
                 yield pending_results.popleft().result()
             pending_results.append(pool.submit(function, item))
         while pending_results:

@@ -6,14 +6,22 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import BaseVector, Joints, Matrices, Matrix, on_cores
+from jaxid.arrays import BaseVector, Joints, Matrix
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, ObservedLogs, Progress
 from jaxid.robot.robot import Robot
 
-from .factors import Blocks, Factors, Ranges, RowChunk, empty_factors, row_chunks
+from .factors import (
+    SAMPLES_PER_CHUNK,
+    Blocks,
+    Factors,
+    Ranges,
+    RowChunk,
+    empty_factors,
+    row_chunks,
+)
 
 
 class Span(NamedTuple):
@@ -44,7 +52,7 @@ class RegressionProblem:
         names: Names of the recordings; by default their own.
     """
 
-    samples_per_chunk = 32768
+    samples_per_chunk = SAMPLES_PER_CHUNK
     """Samples whose columns are evaluated at once."""
     cached_numbers = 2**26
     """Numbers (half a gigabyte) up to which columns are kept for the next pass."""
@@ -115,12 +123,9 @@ class RegressionProblem:
         empty_part = empty_factors(self.base.acting_columns, self.base.size)
         parts = [empty_part] * (len(self._edges[number]) - 1)
         first_block = self._first_block(number)
-
-        def reduce(chunk: RowChunk) -> tuple[int, Factors]:
-            return chunk.block - first_block, empty_part.append(equations(chunk))
-
-        for block, factors in on_cores(reduce, self.recording_chunks(number)):
-            parts[block] += factors
+        for chunk in self.recording_chunks(number):
+            block = chunk.block - first_block
+            parts[block] = parts[block].append(equations(chunk))
         return parts
 
     def _first_block(self, number: int) -> int:
@@ -192,10 +197,11 @@ class RegressionProblem:
         """
         self.require_rows()
 
-        def equations(chunk: RowChunk) -> Matrices:
+        def equations(chunk: RowChunk) -> Iterator[Matrix]:
             row_weights = np.sqrt(weight(chunk.residuals(p) / scale))
             joints = zip(chunk.equations(), row_weights.T, chunk.mask.T, strict=True)
-            return [roots[mask, None] * rows for rows, roots, mask in joints]
+            for rows, roots, mask in joints:
+                yield roots[mask, None] * rows
 
         parts = []
         for number in range(len(self.recordings)):

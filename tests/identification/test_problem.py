@@ -5,6 +5,7 @@ import pytest
 from virtual import dense, observations, standard_parameters
 
 import jaxid as jid
+from jaxid.identification.factors import JointFactor
 
 WEIGHTS = np.array([0.3, 2.0])
 
@@ -105,3 +106,18 @@ def test_factors_alone_give_no_pass(base, recordings):
     for refused in (lambda: next(problem.chunks()), lambda: problem.with_base(base)):
         with pytest.raises(ValueError, match="needs the rows themselves"):
             refused()
+
+
+def test_an_almost_singular_triangle_takes_more_rows_without_losing_digits():
+    """Like friction of a joint that has only moved in one direction so far."""
+    random = np.random.default_rng(0)
+    parts = [random.normal(size=(rows, 4)) for rows in (50, 200, 300)]
+    for part, difference in zip(parts, (1e-14, 1e-13, 1.0), strict=True):
+        part[:, 2] = part[:, 1] + difference * part[:, 2]
+    factor = JointFactor((0, 1, 2), np.zeros((0, 4)), 0)
+    for part in parts:
+        factor = factor.append(part)
+        rows = np.concatenate(parts)[: factor.rows]
+        np.testing.assert_allclose(
+            factor.R.T @ factor.R, rows.T @ rows, atol=1e-12 * factor.rows
+        )

@@ -7,7 +7,6 @@ much of it the fit has explained, and the power of the residuals.
 
 import itertools
 import math
-import os
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -203,9 +202,7 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate) -> RowSpectra:
 
     # This thread makes the rows of the next stretch while others transform the channels
     # of one.
-    other_cores = max(1, (os.cpu_count() or 1) - 1)
-    joints = problem.robot.joints
-    for task, spectra in on_cores(transform, channels(), other_cores, joints):
+    for task, spectra in on_cores(transform, channels()):
         c = task.number
         task.lines.add_channel(c, spectra)
         inverses[c] = estimate.inverse[:, list(task.channel.columns)]
