@@ -7,7 +7,7 @@ import numpy as np
 import scipy
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 
-from jaxid.calibration.frames import Frame
+from jaxid.calibration.frames import ORIGIN, Frame
 from jaxid.calibration.geometry_fit import GeometryFit
 from jaxid.errors import InputError
 from jaxid.io import FilePath, write_bytes
@@ -82,29 +82,48 @@ def _mjcf(fit: GeometryFit, robot: Robot, source: FilePath) -> bytes:
     mujoco = import_mujoco()
     model = mujoco.MjModel.from_xml_path(str(source))
     spec = mujoco.MjSpec.from_file(str(source))
+    spec.compile()
+    root = etree.fromstring(spec.to_xml().encode())
     names = [joint.name for joint in spec.joints]
     _require_joints(robot, names, source)
-    for name, correction in zip(robot.body_names, _corrections(fit), strict=True):
-        body = spec.joint(name).parent
-        if len(body.joints) > 1:
-            raise InputError(
-                f"`{source}`: body `{body.name}` has several joints, whose origins "
-                "cannot differ: give each joint a body of its own."
-            )
-        number = model.body(body.name).id
-        anchor = np.asarray(spec.joint(name).pos)
-        start = Frame(
-            rotation_of_quaternion(model.body_quat[number]), model.body_pos[number]
-        )
+    corrections = dict(zip(robot.body_names, _corrections(fit), strict=True))
+    for body in root.find("worldbody").iter("body"):
+        joints = [x for x in body.iterchildren("joint") if x.get("name") in corrections]
+        if joints:
+            _correct_body(model, body, joints, corrections)
+    return etree.tostring(root, encoding="utf-8") + b"\n"
+
+
+def _correct_body(
+    model: Any, body: Any, joints: list[Any], corrections: dict[str, Frame]
+) -> None:
+    """Place a body and its joints, each of which moves all after it.
+
+    Args:
+        model: Model of the file before.
+        body: Element of the body.
+        joints: Elements of its joints.
+        corrections: Corrections at the joints, by their names.
+    """
+    models = [model.joint(joint.get("name")) for joint in joints]
+    number = int(models[0].bodyid[0])
+    rotation = rotation_of_quaternion(model.body_quat[number])
+    start = Frame(rotation, model.body_pos[number])
+    motion = ORIGIN
+    places = []
+    for joint in models:
         # The frame of a jaxid body has its origin at the joint.
-        at_joint = start @ Frame(np.eye(3), anchor) @ correction
-        frame = at_joint @ Frame(np.eye(3), -anchor)
-        body.pos = frame.position
-        quaternion = scipy.spatial.transform.Rotation.from_matrix(frame.rotation)
-        body.quat = np.roll(quaternion.as_quat(), 1)
-        body.alt.type = mujoco.mjtOrientation.mjORIENTATION_QUAT
-    spec.compile()
-    return spec.to_xml().encode()
+        at_joint = start @ Frame(np.eye(3), joint.pos)
+        motion = motion @ at_joint @ corrections[joint.name] @ at_joint.inverse
+        places.append(motion @ at_joint)
+    frame = motion @ start
+    quaternion = scipy.spatial.transform.Rotation.from_matrix(frame.rotation)
+    body.set("pos", exact_text(frame.position))
+    body.set("quat", exact_text(np.roll(quaternion.as_quat(), 1)))
+    for element, joint, place in zip(joints, models, places, strict=True):
+        at_joint = frame.inverse @ place
+        element.set("pos", exact_text(at_joint.position))
+        element.set("axis", exact_text(at_joint.rotation @ joint.axis))
 
 
 def _require_joints(robot: Robot, names: list[Any], source: FilePath) -> None:

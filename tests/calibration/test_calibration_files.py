@@ -128,16 +128,19 @@ def test_the_written_urdf_is_the_calibrated_robot(report, folder):
     ]
 
 
-def test_a_written_mjcf_is_the_calibrated_robot(tmp_path):
+JOINT = '<joint name="j{i}" pos="0.02 0.03 0.{i}" axis="0 {y} {z}"/>'
+BODY = '<body name="b{i}" pos="0.1 0 0.3" euler="10 20 0">{joints}<geom size="0.1"/>'
+
+
+@pytest.mark.parametrize("joints_of_bodies", [((0,), (1,), (2,)), ((0, 1), (2,))])
+def test_a_written_mjcf_is_the_calibrated_robot(tmp_path, joints_of_bodies):
     """Joints beside the origins of their bodies move the tip as they should."""
-    body = ""
-    for i in range(3):
-        body += (
-            f'<body name="b{i}" pos="0.1 0 0.3" euler="10 20 0"><joint name="j{i}" '
-            f'pos="0.02 0.03 0" axis="0 {i % 2} {1 - i % 2}"/>'
-            '<geom type="sphere" size="0.05" pos="0 0 0.2" mass="1"/>'
-        )
-    text = f"<mujoco><worldbody>{body}{'</body>' * 3}</worldbody></mujoco>"
+    text = ""
+    for numbers in joints_of_bodies:
+        joints = [JOINT.format(i=i, y=i % 2, z=1 - i % 2) for i in numbers]
+        text += BODY.format(i=numbers[-1], joints="".join(joints))
+    text += "</body>" * len(joints_of_bodies)
+    text = f"<mujoco><worldbody>{text}</worldbody></mujoco>"
     source = tmp_path / "arm.xml"
     source.write_text(text)
     robot = jid.load_mjcf(source)
@@ -157,15 +160,15 @@ def test_a_written_mjcf_is_the_calibrated_robot(tmp_path):
         data.qpos[:] = x
         mujoco.mj_forward(model, data)
         rotation, _ = TrueArm(fit.robot).placement(x)
-        assert data.body("b2").xmat.reshape(3, 3) == pytest.approx(rotation, abs=1e-6)
+        assert data.body("b2").xmat.reshape(3, 3) == pytest.approx(rotation, abs=1e-9)
         origin = data.body("b2").xpos + data.body("b2").xmat.reshape(3, 3) @ (
             0.02,
             0.03,
-            0.0,
+            0.2,
         )
         expected = TrueArm(fit.robot.replace(tip_offset=np.zeros(3)))
         expected.tip.translation[:] = 0.0
-        assert origin == pytest.approx(expected.placement(x)[1], abs=1e-6)
+        assert origin == pytest.approx(expected.placement(x)[1], abs=1e-9)
 
 
 @pytest.mark.parametrize(
