@@ -1,16 +1,20 @@
 """A robot on legs, simulated by MuJoCo: what its logs determine, and how well.
 
-A quadruped (Go2 of example-robot-data) stands on MuJoCo's ground. Controllers of its
-joint angles move the base, and lift one foot after another. The logs hold angles,
-torques, gyroscope, accelerometer, and whether each foot touches the ground: no
-attitude, no velocity of the base, and no contact force.
+Quadrupeds (Go2 and ANYmal C of example-robot-data) stand on MuJoCo's ground.
+Controllers of their joint angles move the base, and lift one foot after another. A
+humanoid (G1) balances by whole-body control, shifts its weight and steps in place. The
+logs hold angles, torques, gyroscope, accelerometer, and whether each foot touches the
+ground: no attitude, no velocity of the base, and no contact force. Every draw has a
+motion and a noise of its own; settings are those of `jaxid identify`.
 
-    python benchmarks/floating.py               # some minutes
+    python benchmarks/floating.py                   # Go2: half an hour
     python benchmarks/floating.py --quick
+    python benchmarks/floating.py --robot G1        # or "ANYmal C"; --all for all
 """
 
 import argparse
 import re
+import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,6 +22,7 @@ import jax
 import mujoco
 import numpy as np
 import pinocchio as pin
+from balancing import CONTROL_STEPS, Balance
 from timing import Row, hand_over
 
 import jaxid as jid
@@ -26,7 +31,8 @@ jax.config.update("jax_enable_x64", True)
 ROBOTS = Path(pin.__file__).parents[4] / "share/example-robot-data/robots"
 STEP = 0.001
 PHASE = 8.0  # duration of a phase: all feet stand, or one is lifted [s]
-SAMPLE_TIME = 2 * STEP
+RECORD_STEPS = 4
+SAMPLE_TIME = RECORD_STEPS * STEP
 NOISE = {"angles": 2e-4, "forces": 0.1, "gyro": 0.01, "accelerometer": 0.1}
 FILTER = jid.ZeroPhaseButterworth(10.0)
 
@@ -59,7 +65,9 @@ class Legged(NamedTuple):
 
     def truth(self, model: jid.Model) -> np.ndarray:
         """Return the true standard parameters of a model."""
-        bodies = np.array(jid.robots.urdf_parameters(ROBOTS / self.path, floating=True))
+        bodies = np.array(
+            jid.robots.urdf_parameters(ROBOTS / self.path, check=False, floating=True)
+        )
         values = {"fv": self.damping, "fc": self.friction, "Ia": self.armature}
         rest = [values.get(name[:2], 0.0) for name in model.parameter_names]
         return np.concatenate([bodies, rest[len(bodies) :]])
@@ -70,6 +78,37 @@ GO2 = Legged(
     {f"{leg}_foot": jid.Sphere(0.022) for leg in ("FL", "FR", "RL", "RR")},
     {"hip": 0.0, "thigh": 0.8, "calf": -1.6},
 )
+ANYMAL = Legged(
+    "anymal_c_simple_description/urdf/anymal.urdf",
+    {f"{leg}_FOOT": jid.Sphere(0.03) for leg in ("LF", "RF", "LH", "RH")},
+    {"F_HFE": 0.7, "F_KFE": -1.2, "H_HFE": -0.7, "H_KFE": 1.2},
+    armature=0.1,
+    damping=1.0,
+    friction=1.5,
+    stiffness=600.0,
+    rate_gain=15.0,
+    torque=150.0,
+    sway=(0.02, 0.02, 0.02, 0.06, 0.06, 0.08),
+    shift=(0.12, 0.1),
+)
+G1 = Legged(
+    "g1_description/urdf/g1_29dof_rev_1_0.urdf",
+    {f"{side}_ankle_roll_link": jid.Sole() for side in ("left", "right")},
+    {
+        "hip_pitch": -0.45,
+        "knee": 0.9,
+        "ankle_pitch": -0.45,
+        "shoulder_pitch": 0.2,
+        "elbow": 0.6,
+        "left_shoulder_roll": 0.25,
+        "right_shoulder_roll": -0.25,
+    },
+    armature=0.02,
+    damping=0.3,
+    friction=0.3,
+    sole=(0.085, 0.03, 0.01),
+)
+QUADRUPEDS = {"Go2": GO2, "ANYmal C": ANYMAL}
 
 
 def mjcf(robot: Legged, model: pin.Model) -> str:
@@ -183,9 +222,18 @@ class Plan:
 
     def _fold(self, leg: np.ndarray) -> np.ndarray:
         """Return a step of a leg's joints that lifts its foot."""
-        if len(leg) == 3:
-            return np.array([0.0, 0.35, -0.7])
-        return np.array([-0.25, 0.0, 0.0, 0.5, -0.25, 0.0])
+        # Knees point forwards or backwards.
+        side = -np.sign(self.stand[1 + leg[2]])
+        return side * np.array([0.0, 0.35, -0.7])
+
+    def torques(self, d: Any, t: float) -> np.ndarray:
+        """Return the torques of the drives, which follow the reference."""
+        robot = self.robot
+        if round(t / STEP) % 5 == 0:
+            self.reference = self(t)
+        torque = robot.stiffness * (self.reference - d.qpos[7:])
+        torque = torque - robot.rate_gain * d.qvel[6:]
+        return np.clip(torque, -robot.torque, robot.torque)
 
     def _step(self, pose: pin.SE3) -> None:
         """Move the legs towards feet that stay on the ground."""
@@ -196,12 +244,7 @@ class Plan:
             wanted = pose.inverse() * foot
             J = pin.getFrameJacobian(model, data, frame, pin.LOCAL_WORLD_ALIGNED)
             error = wanted.translation - data.oMf[frame].translation
-            J = J[:, leg]
-            if len(leg) < 6:
-                J = J[:3]
-            else:
-                R = wanted.rotation @ data.oMf[frame].rotation.T
-                error = np.concatenate([error, pin.log3(R)])
+            J = J[:3, leg]
             damped = J.T @ J + 1e-6 * np.eye(len(leg))
             self.q[1 + leg] += np.linalg.solve(damped, J.T @ error)
 
@@ -214,32 +257,35 @@ def simulate(
     load: pin.Inertia | None = None,
     lifts: bool = True,
 ) -> dict[str, np.ndarray]:
-    """Return the channels of a log without noise, and how upright the base was."""
+    """Return the channels of a log without noise, and how upright the base was.
+
+    Torques are those that MuJoCo's actuators applied, at the instants of the angles.
+    """
     pinned = robot.pinned()
     if load is not None:
         pinned.inertias[1] = pinned.inertias[1] + load
-    plan = Plan(robot, robot.pinned(), seed, lifts)
+    plan: Any = Plan(robot, robot.pinned(), seed, lifts)
     m = mujoco.MjModel.from_xml_string(mjcf(robot, pinned))
     d = mujoco.MjData(m)
     feet = [m.geom(f"f{number}").id for number in range(len(robot.feet))]
     d.qpos[7:] = plan.stand[7:]
     mujoco.mj_forward(m, d)
-    half_height = 0.01 if robot.sole else 0.022
+    half_height = m.geom_size[feet[0], 2 if robot.sole else 0]
     d.qpos[2] -= min(d.geom_xpos[g, 2] for g in feet) - half_height
+    if robot.sole is not None:
+        mujoco.mj_forward(m, d)
+        plan = Balance(m, d, feet, seed)
     keys = ("angles", "forces", "gyro", "accelerometer", "contact", "up")
     log: dict[str, Any] = {key: [] for key in keys}
     force = np.zeros(6)
     for k in range(round(seconds / STEP)):
-        if k % 5 == 0:
-            reference = plan(k * STEP)
-        torque = (
-            robot.stiffness * (reference - d.qpos[7:]) - robot.rate_gain * d.qvel[6:]
-        )
-        d.ctrl[:] = np.clip(torque, -robot.torque, robot.torque)
+        if k % CONTROL_STEPS == 0 or robot.sole is None:
+            d.ctrl[:] = plan.torques(d, k * STEP)
+        angles, rates = d.qpos[7:].copy(), d.qvel[3:6].copy()
         mujoco.mj_step(m, d)
-        if k % 2:
+        if k % RECORD_STEPS:
             continue
-        mujoco.mj_forward(m, d)
+        # Accelerations and forces are those at the begin of the step.
         R = d.xmat[1].reshape(3, 3)
         loads = np.zeros(len(feet))
         for number in range(d.ncon):
@@ -247,9 +293,9 @@ def simulate(
                 if geom in feet:
                     mujoco.mj_contactForce(m, d, number, force)
                     loads[feet.index(geom)] += force[0]
-        log["angles"].append(d.qpos[7:].copy())
+        log["angles"].append(angles)
         log["forces"].append(d.ctrl.copy())
-        log["gyro"].append(d.qvel[3:6].copy())
+        log["gyro"].append(rates)
         log["accelerometer"].append(R.T @ (d.qacc[:3] - m.opt.gravity))
         log["contact"].append((loads > 2.0).astype(float))
         log["up"].append(R[2, 2])
@@ -273,34 +319,105 @@ def recording(
     return jid.Recording.of(**channels, sample_time=SAMPLE_TIME, name=name)
 
 
-class Study:
-    """Draws of noise on one log, and how well the truth is found."""
+COLUMNS = jid.Columns(
+    angles="q{}",
+    forces="tau{}",
+    gyro="gyro{}",
+    accelerometer="acc{}",
+    contact="contact{}",
+    sample_time=SAMPLE_TIME,
+)
 
-    def __init__(self, robot: Legged, log: dict[str, Any], other: dict[str, Any]):
-        self.robot, self.log = robot, log
-        self.described = robot.load()
-        self.base = jid.base_parameters(jid.Model(self.described))
+
+def write(log: dict[str, np.ndarray], path: Path, seed: int) -> Path:
+    """Write a log with noise as a CSV file."""
+    noisy = recording(log, np.random.default_rng(seed))
+    channels = {
+        "q": noisy.angles,
+        "tau": noisy.forces,
+        "gyro": noisy.base.rates,
+        "acc": noisy.base.accelerations,
+        "contact": noisy.base.contacts,
+    }
+    names = [f"{key}{k + 1}" for key, x in channels.items() for k in range(x.shape[1])]
+    table = np.column_stack([np.asarray(x) for x in channels.values()])
+    np.savetxt(path, table, delimiter=",", header=",".join(names), comments="")
+    return path
+
+
+def humanoid(seconds: float) -> list[Row]:
+    """G1: a log of weight shifts and steps, another one for validation."""
+    setup = jid.Setup(G1.load())
+    with tempfile.TemporaryDirectory() as folder:
+        log = write(simulate(G1, 1, seconds), Path(folder) / "log.csv", 1)
+        other = write(simulate(G1, 2, seconds / 2), Path(folder) / "other.csv", 2)
+        report = jid.identify_logs(setup, [log], COLUMNS, verify=[other])
+    print(report, flush=True)
+    base, fit = setup.base, report.fit
+    total = total_mass_row(base)
+    truth = total @ base.from_standard(G1.truth(base.model))
+    mass = float(total @ fit.parameters)
+    width = 2.0 * float(np.sqrt(total @ fit.uncertainty.covariance @ total))
+    error = abs(mass / truth - 1.0)
+    worst = max(errors.relative for errors in report.verification)
+    recipe = f"floating.py --robot g1, one log of {seconds:g} s"
+    return [
+        Row(
+            "43",
+            f"G1: total mass of {truth:.2f} kg",
+            recipe,
+            "0.3 %",
+            f"{mass:.3f} ± {width:.3f} kg, {100 * error:.2f} %",
+            error < 3e-3,
+        ),
+        Row(
+            "43",
+            "G1: verdict; torque error on another motion",
+            recipe,
+            "right",
+            f"{report.verdict.status.name}; {100 * worst:.1f} %",
+            True,
+        ),
+    ]
+
+
+def total_mass_row(base: jid.BaseParameters) -> np.ndarray:
+    """Return the row that adds up the masses of all bodies."""
+    total = np.zeros(base.model.size)
+    total[: 10 * len(base.model.robot.solid_bodies) : 10] = 1.0
+    return total[np.array(base.indices)]
+
+
+class Study:
+    """Fits with default settings, and how well they find the truth."""
+
+    def __init__(self, robot: Legged, seconds: float):
+        self.robot, self.seconds = robot, seconds
+        self.setup = jid.Setup(robot.load())
+        self.base = self.setup.base
         self.truth = self.base.from_standard(robot.truth(self.base.model))
-        total = np.zeros(self.base.model.size)
-        total[: 10 * len(self.described.solid_bodies) : 10] = 1.0
-        self.total = total[np.array(self.base.indices)]
-        unseen = self.observe(recording(other))
+        self.total = total_mass_row(self.base)
+        other = recording(simulate(robot, 1000, seconds / 2))
+        unseen = self.setup.observe(other)
         self.unseen = [*jid.RegressionProblem(self.base, [unseen]).chunks()]
 
-    def observe(self, log: jid.Recording) -> jid.Observations:
-        """Return the rows of a log, eight for each period of the cut-off."""
-        return jid.observe(log, self.described, FILTER, jid.Subsample(6))
-
     def fit(self, log: jid.Recording) -> jid.Fit:
-        """Identify with a log; intervals by leaving out one of sixty blocks."""
-        rows = jid.RegressionProblem(self.base, [self.observe(log)], divisions=60)
-        return jid.identify(
-            self.base, rows, uncertainty=jid.uncertainty.BlockJackknife()
-        )
+        """Identify with a log."""
+        rows = jid.RegressionProblem(self.base, [self.setup.observe(log)])
+        return self.setup.fit(rows)
+
+    def log(self, seed: int, **changes: Any) -> dict[str, np.ndarray]:
+        """Return the log of a motion."""
+        return simulate(self.robot, seed, self.seconds, **changes)
 
     def draw(self, seed: int) -> jid.Fit:
-        """Identify with noise of its own."""
-        return self.fit(recording(self.log, np.random.default_rng(seed)))
+        """Identify with a motion and noise of its own."""
+        return self.fit(recording(self.log(seed), np.random.default_rng(seed)))
+
+    def coverage(self, fit: jid.Fit) -> float:
+        """Return the share of 95 % intervals that hold the truth."""
+        errors = abs(fit.parameters - self.truth)
+        return float(np.mean(errors < fit.uncertainty.half_widths()))
 
     def torque_error(self, fit: jid.Fit) -> float:
         """Return the error of the forces of another motion, relative to them (RMS)."""
@@ -351,46 +468,26 @@ def in_the_air(log: dict[str, np.ndarray], foot: int) -> dict[str, np.ndarray]:
     starts, stops = edges[::2], edges[1::2]
     # A part of a stance, as a flag that hangs.
     longest = int(np.argmax(stops - starts))
-    start = starts[longest] + 500
+    start = starts[longest] + round(1.0 / SAMPLE_TIME)
     flags = log["contact"].copy()
-    flags[start : start + 1150, foot] = 0.0
+    flags[start : start + round(2.3 / SAMPLE_TIME), foot] = 0.0
     return log | {"contact": flags}
 
 
-def quadruped(draws: int, seconds: float) -> list[Row]:
-    """Go2: draws of noise, a load on its back, and wrong flags."""
-    log, other = simulate(GO2, 1, seconds), simulate(GO2, 2, seconds / 2)
-    study = Study(GO2, log, other)
-    fits = [study.draw(seed) for seed in range(draws)]
+def quadruped(name: str, draws: int, seconds: float) -> list[Row]:
+    """Draws of motion and noise of a quadruped, a load on its back, and wrong flags."""
+    study = Study(QUADRUPEDS[name], seconds)
+    fits = [study.draw(seed) for seed in range(1, draws + 1)]
     true_mass = study.total @ study.truth
     masses = np.array([study.mass(fit)[0] for fit in fits])
     errors = [study.torque_error(fit) for fit in fits]
-    covers = [
-        np.mean(abs(f.parameters - study.truth) < f.uncertainty.half_widths())
-        for f in fits
-    ]
+    covers = [study.coverage(fit) for fit in fits]
     agree = [study.legs_agree(fit) for fit in fits]
-    print(masses - true_mass, errors, covers, agree, flush=True)
+    print(name, masses - true_mass, errors, covers, agree, flush=True)
 
-    load = pin.Inertia(0.5, np.array([0.1, 0.02, 0.09]), np.diag([1e-3] * 3))
-    loaded = simulate(GO2, 1, seconds, load=load)
-    empty, full = fits[0], study.fit(recording(loaded, np.random.default_rng(50)))
-    payload = study.mass(full)[0] - study.mass(empty)[0]
-    width = np.hypot(study.mass(full)[1], study.mass(empty)[1])
-    print("payload", payload, width, flush=True)
-
-    shifted = study.fit(recording(late(log, 0.06), np.random.default_rng(0)))
-    ratio = study.torque_error(shifted) / errors[0]
-    wrong = recording(in_the_air(log, 0), np.random.default_rng(0))
-    spoiled = study.torque_error(study.fit(wrong))
-    checked = jid.workflow.check_contacts(study.base, wrong, FILTER)
-    repaired = study.torque_error(study.fit(checked.recording))
-    named = [text for text in checked.findings if "FL_foot" in text]
-    print(ratio, spoiled / errors[0], repaired / errors[0], named, flush=True)
     mass_error = np.abs(masses / true_mass - 1).max()
     torque_error, cover, agreement = np.mean(errors), np.mean(covers), np.mean(agree)
-    before, after = spoiled / errors[0], repaired / errors[0]
-    values = (
+    values = [
         (
             "total mass, worst draw",
             "0.1 %",
@@ -415,6 +512,32 @@ def quadruped(draws: int, seconds: float) -> list[Row]:
             f"{100 * agreement:.0f} %",
             agreement > 0.9,
         ),
+    ]
+    if name == "Go2":
+        values += load_and_flags(study, fits[0], errors[0])
+    recipe = f"floating.py, {draws} draws of {seconds:g} s"
+    return [Row("43", f"{name}: {what}", recipe, *rest) for what, *rest in values]
+
+
+def load_and_flags(study: Study, empty: jid.Fit, error: float) -> list[tuple]:
+    """Return what a load on the back weighs, and what wrong flags do."""
+    load = pin.Inertia(0.5, np.array([0.1, 0.02, 0.09]), np.diag([1e-3] * 3))
+    loaded = study.log(1, load=load)
+    full = study.fit(recording(loaded, np.random.default_rng(50)))
+    payload = study.mass(full)[0] - study.mass(empty)[0]
+    width = np.hypot(study.mass(full)[1], study.mass(empty)[1])
+    print("payload", payload, width, flush=True)
+
+    log = study.log(1)
+    shifted = study.fit(recording(late(log, 0.06), np.random.default_rng(1)))
+    ratio = study.torque_error(shifted) / error
+    wrong = recording(in_the_air(log, 0), np.random.default_rng(1))
+    before = study.torque_error(study.fit(wrong)) / error
+    checked = jid.workflow.check_contacts(study.base, wrong, study.setup.filter)
+    after = study.torque_error(study.fit(checked.recording)) / error
+    named = [text for text in checked.findings if "FL_foot" in text]
+    print(ratio, before, after, named, flush=True)
+    return [
         (
             "0.5 kg on the back, two logs",
             "2 %, covered",
@@ -428,17 +551,22 @@ def quadruped(draws: int, seconds: float) -> list[Row]:
             f"{named[:1]}; {before:.1f}, checked {after:.2f}",
             bool(named),
         ),
-    )
-    recipe = f"floating.py, {draws} draws of {seconds:g} s"
-    return [Row("43", f"Go2: {what}", recipe, *rest) for what, *rest in values]
+    ]
 
 
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
     parser.add_argument("--draws", type=int, default=20)
+    parser.add_argument("--robot", default="Go2", choices=[*QUADRUPEDS, "G1"])
+    parser.add_argument("--all", action="store_true", help="all robots")
     parser.add_argument("--json")
     options = parser.parse_args()
     draws, seconds = (2, 24.0) if options.quick else (options.draws, 40.0)
-    rows = quadruped(draws, seconds)
+    rows = []
+    for name in [*QUADRUPEDS, "G1"] if options.all else [options.robot]:
+        if name == "G1":
+            rows += humanoid(seconds)
+        else:
+            rows += quadruped(name, draws, seconds)
     hand_over(rows, options.json)

@@ -224,14 +224,14 @@ class Observations(eqx.Module):
         """Return motion and forces of some samples of one segment."""
         return self.source.read(samples)
 
-    def row_speeds(self, rows: slice) -> Float[np.ndarray, "rows joints"]:
-        """Return the speeds at some rows of one segment [rad/s or m/s]."""
+    def row_motion(self, rows: slice) -> Motion:
+        """Return the motion at some rows of one segment; it is not reduced."""
         samples = self.instants[rows]
         first_sample = int(samples[0])
         last_sample = int(samples[-1])
         factor = self.decimation.factor
         motion, _ = self.read(slice(first_sample, last_sample + 1, factor))
-        return np.abs(np.asarray(motion.qd))
+        return motion
 
     def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Any:
         """Turn forces or columns at all samples into rows (Eq. 26).
@@ -483,7 +483,8 @@ def _speed_mask(
     """Return the rows at which each joint is as fast as its speed."""
     masks = []
     for chunk in observations.chunks(65536):
-        masks.append(observations.row_speeds(slice(*chunk.rows)) >= speeds)
+        motion = observations.row_motion(slice(*chunk.rows))
+        masks.append(np.abs(np.asarray(motion.qd)) >= speeds)
         if progress is not None:
             progress(chunk.rows[1] / observations.rows)
     return np.concatenate(masks)

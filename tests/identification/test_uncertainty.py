@@ -15,6 +15,7 @@ from virtual import (
 
 import jaxid as jid
 from jaxid.identification.uncertainty import UNCERTAINTIES, spectra_of_rows
+from jaxid.identification.uncertainty.slow_rows import HeldFriction
 from jaxid.identification.uncertainty.spectral import (
     SpectralTable,
     sandwich,
@@ -238,6 +239,31 @@ def test_friction_that_lacks_near_rest_is_part_of_the_intervals():
     assert np.mean(alone) < 0.7
     assert np.mean(held) > 0.9
     assert np.mean(widening) < 1.05
+
+
+def test_held_friction_changes_estimates_as_columns_of_a_larger_fit():
+    random = np.random.default_rng(5)
+    rows = random.normal(size=(300, 6))
+    columns = np.column_stack([random.normal(size=(300, 3)), np.zeros(300)])
+    columns[:, 0] += rows[:, 1]
+    forces = random.normal(size=300)
+    inverse = np.linalg.inv(rows.T @ rows)
+    p = inverse @ rows.T @ forces
+    half = 0.5  # share of the rows that were looked at: the products are smaller
+    held = HeldFriction(
+        half * rows.T @ columns,
+        half * columns.T @ columns,
+        half * columns.T @ (forces - rows @ p),
+        half,
+    )
+    changes, growth = held.changes(inverse)
+
+    every_column = np.column_stack([rows, columns[:, :3]])
+    larger_inverse = np.linalg.inv(every_column.T @ every_column)
+    larger_fit = (larger_inverse @ every_column.T @ forces)[:6]
+    assert np.allclose(changes, larger_fit - p)
+    variances = np.diag(larger_inverse)[:6] / np.diag(inverse)
+    assert np.allclose(half * growth, variances - 1.0)
 
 
 def sandwich_alone(base, o):

@@ -5,6 +5,7 @@ import pinocchio as pin
 import pytest
 
 import jaxid as jid
+from jaxid.identification.uncertainty.slow_rows import acting_friction
 from jaxid.measurement.floating_base import vertical
 from jaxid.robot.contacts import legs_of
 
@@ -128,6 +129,19 @@ def test_contact_forces_drop_out(robot):
     # Three patterns of contact, with guards around the changes.
     assert len(observations.segments) == 3
     assert legs_of(robot).own_joints == ((6, 7, 8), (9, 10, 11))
+
+
+def test_friction_of_a_leg_acts_on_the_base_as_the_model_says(robot):
+    robot, path = robot
+    log = log_of(robot, path, seconds=6.0)
+    del log["missing"]
+    filter = jid.ZeroPhaseButterworth(20.0, order=4)
+    motion = jid.observe(jid.Recording.of(**log), robot, filter).reduced_motion
+    model = jid.Model(robot, (jid.terms.ViscousFriction(),))
+    theta = np.asarray(model.regressor(motion))
+    for joint in range(robot.joints):
+        columns = acting_friction(legs_of(robot), motion, motion.qd, joint)
+        assert np.allclose(columns[:, list(robot.driven)], theta[:, joint])
 
 
 def test_vertical_follows_gravity_while_the_base_turns():

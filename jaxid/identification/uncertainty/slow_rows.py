@@ -5,8 +5,10 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import BaseMatrix, BaseVector
+from jaxid.arrays import BaseMatrix, BaseVector, Joints, Matrix, Vector
+from jaxid.dynamics.motion import Motion
 from jaxid.result_table import significant
+from jaxid.robot.contacts import Legs, legs_of
 
 from ..estimators.estimate import Estimate
 from ..problem import RegressionProblem
@@ -63,18 +65,49 @@ class SlowRows(NamedTuple):
         return scale * solution[:, -1], growth / self.share
 
 
+class HeldFriction(NamedTuple):
+    """Friction that joints of legs may hold for a while where they turn back.
+
+    Of twelve joints of legs that stand one is always slow: rows of the base without
+    slow joints are too few to fit. So each joint gets a column of its own: friction
+    that does not change its direction where the speed does, but later.
+    """
+
+    cross: Matrix  # products of the weighted rows and these columns [base, joints]
+    products: Matrix  # of these columns [joints, joints]
+    gradient: Vector  # products of these columns and the residuals
+    share: float  # fraction (0 to 1) of the rows that were looked at
+
+    def changes(self, inverse: BaseMatrix) -> tuple[BaseVector, BaseVector]:
+        """Return how estimates change with these columns, and their variances.
+
+        The variances are relative to those without, for errors that are noise.
+        """
+        change_by_column = inverse @ self.cross / self.share
+        explained_products = self.cross.T @ change_by_column
+        remaining_inverse = np.linalg.pinv(
+            self.products - explained_products, rcond=1e-9, hermitian=True
+        )
+        steps = change_by_column @ remaining_inverse
+        variances = np.sum(steps * change_by_column, axis=1)
+        sizes = np.diag(inverse)
+        growth = variances / np.where(sizes > 0, sizes, np.inf)
+        return -steps @ self.gradient, growth
+
+
 def with_friction_near_rest(
     errors: Uncertainty, problem: RegressionProblem, estimate: Estimate
 ) -> Uncertainty:
     """Return the uncertainty with what friction near rest does to the estimates.
 
     Joints that stick where they turn back shift friction and inertia alike in every
-    log, which no scatter of residuals tells. Estimates without the slow rows do not
-    have this error: where both differ by more than noise, intervals include the
-    difference.
+    log, which no scatter of residuals tells. Estimates without the slow rows, or of
+    legs with friction that is held, do not have this error: where both differ by more
+    than noise, intervals include the difference.
     """
-    slow_rows = _slow_rows(problem, estimate)
-    changes, growth = slow_rows.changes(estimate.inverse)
+    has_legs = bool(problem.base.model.robot.contacts)
+    evidence_of = _held_friction if has_legs else _slow_rows
+    changes, growth = evidence_of(problem, estimate).changes(estimate.inverse)
     variances = np.diag(errors.covariance)
     is_known = np.isfinite(variances) & (variances > 0)
     known_variances = np.where(is_known, variances, 1.0)
@@ -87,32 +120,81 @@ def with_friction_near_rest(
     notes = errors.notes
     if ratios.max(initial=1.0) > LIMITS.widening:
         parameter = problem.base.names[int(np.argmax(ratios))]
+        advice = "leave slow rows out (`rows.min_speed`)"
+        if has_legs:
+            advice = "let joints turn back less often, at higher accelerations"
         note = (
             f"rows slower than {100 * LIMITS.speed:g} % of the top speed of a joint "
             "disagree with the other rows, which is typical of joints that stick. The "
             "intervals include this difference and are up to "
             f"{significant(ratios.max(), 2)} times as wide as without it, with the "
-            f"largest change for `{parameter}`; leave slow rows out "
-            "(`rows.min_speed`)."
+            f"largest change for `{parameter}`; {advice}."
         )
         notes = (*notes, note)
     return dataclasses.replace(errors, covariance=covariance, notes=notes)
 
 
+def _row_motions(problem: RegressionProblem) -> tuple[list[Motion], Joints]:
+    """Return the motion of each stretch of rows, and the top speed of each joint."""
+    stretches, _ = divide_into_stretches(problem)
+    motions = []
+    for recording, start, stop in stretches:
+        motions.append(problem.recordings[recording].row_motion(slice(start, stop)))
+    top_speeds = np.max([np.abs(x.qd).max(axis=0) for x in motions], axis=0)
+    return motions, top_speeds
+
+
+def _held_friction(problem: RegressionProblem, estimate: Estimate) -> HeldFriction:
+    """Return what the rows tell of friction that joints of legs hold."""
+    robot = problem.base.model.robot
+    legs = legs_of(robot)
+    motions, top_speeds = _row_motions(problem)
+    slow_speeds = LIMITS.speed * np.maximum(top_speeds, 1e-9)
+    slow_speeds[list(robot.virtual)] = np.inf
+
+    cross = np.zeros((problem.base.size, robot.joints))
+    products = np.zeros((robot.joints, robot.joints))
+    gradient = np.zeros(robot.joints)
+    rows = 0
+    for chunk, motion in zip(spread_rows(problem), motions, strict=True):
+        rows += int(chunk.mask.sum())
+        slowness = np.exp(-((np.asarray(motion.qd) / slow_speeds) ** 2))
+        directions = np.sign(motion.qdd)
+        directions[:, list(robot.virtual)] = 0.0
+        residuals = chunk.residuals(estimate.parameters)
+        channels = estimate.influence(chunk, residuals)
+        weights = np.where(chunk.mask, np.asarray(estimate.weights), 0.0)
+        for joint, channel in enumerate(channels):
+            acting = acting_friction(legs, motion, slowness * directions, joint)
+            columns = weights[:, joint, None] * acting
+            cross[list(channel.columns)] += channel.equations.T @ columns
+            products += columns.T @ columns
+            gradient += columns.T @ channel.disturbance
+    return HeldFriction(cross, products, gradient, rows / problem.factors.rows.sum())
+
+
+def acting_friction(legs: Legs, motion: Motion, friction: Matrix, joint: int) -> Matrix:
+    """Return what friction of each joint does in the rows of one joint."""
+    columns = np.zeros_like(friction)
+    columns[:, joint] = friction[:, joint]
+    if joint in legs.rows:
+        shape = (len(friction), len(legs.rows), len(legs.joints))
+        entries = np.asarray(motion.contacts).reshape(shape)
+        X = entries[:, legs.rows.index(joint)]
+        leg_joints = list(legs.joints)
+        columns[:, leg_joints] -= X * friction[:, leg_joints]
+    return columns
+
+
 def _slow_rows(problem: RegressionProblem, estimate: Estimate) -> SlowRows:
     """Return what the slow rows of each joint tell of the parameters."""
-    stretches, _ = divide_into_stretches(problem)
-    speeds = []
-    for recording, start, stop in stretches:
-        speeds.append(problem.recordings[recording].row_speeds(slice(start, stop)))
-    top_speeds = np.max([x.max(axis=0) for x in speeds], axis=0)
-
+    motions, top_speeds = _row_motions(problem)
     size = problem.base.size
     information = np.zeros((size, size))
     gradient = np.zeros(size)
     rows = 0
-    for chunk, speed in zip(spread_rows(problem), speeds, strict=True):
-        is_slow = speed < LIMITS.speed * top_speeds
+    for chunk, motion in zip(spread_rows(problem), motions, strict=True):
+        is_slow = np.abs(motion.qd) < LIMITS.speed * top_speeds
         rows += int(chunk.mask.sum())
         residuals = chunk.residuals(estimate.parameters)
         channels = estimate.influence(chunk, residuals)
