@@ -89,6 +89,26 @@ def test_seven_joints(dtype, bound, on_gpu):
     assert error(found, expected) <= bound
 
 
+@pytest.fixture
+def places_results(monkeypatch):
+    """Many results by two kernels, which is off until it has been timed on a GPU."""
+    monkeypatch.setattr(gpu_kernel, "MAX_PLACED_OUTPUTS", 1000)
+
+
+@pytest.mark.parametrize("samples", [1, 2 * BLOCK + 1])
+def test_many_results_are_placed_by_a_second_kernel(samples, on_gpu, places_results):
+    model = jid.Model(ARM.robot, (*ARM.terms, jid.ConstantOffset()))
+    _, *arrays = numbers(model, samples)
+    found = jax.jit(lambda *x: model.regressor(jid.Motion(*x)))(*arrays)
+    assert model.robot.joints * model.size > gpu_kernel.MAX_OUTPUTS
+    expected = in_numpy(model, model.columns, *arrays)
+    assert found.dtype == np.float64
+    assert error(found, expected) <= 1e-15
+    # Constants are stored too: zeros, and the columns of the offsets.
+    np.testing.assert_array_equal(np.asarray(found)[expected == 0.0], 0.0)
+    np.testing.assert_array_equal(found[..., -2:], [np.eye(2)] * samples)
+
+
 def test_every_operation():
     def function(x):
         return every_operation(x[0], x[1])
@@ -187,10 +207,38 @@ def test_a_gpu_gets_one_kernel(name, has_gpu):
     assert text.count("custom_call") == 1
     assert "stablehlo.sine" not in text
     assert "stablehlo.optimization_barrier" not in text
+    # A kernel reads and writes rows of samples as they are in memory.
+    assert "stablehlo.transpose" not in text
     for platform in ("cpu", "tpu"):
         text = compiled_for(platform, method, *arguments)
         assert KERNEL not in text
         assert "stablehlo" in text
+
+
+@lowers_without_gpu
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_a_gpu_gets_two_kernels_for_many_results(dtype, has_gpu, places_results):
+    p, *arrays = (x.astype(dtype) for x in numbers(PANDA, 300))
+    texts = [
+        compiled_for("cuda", PANDA.mass_matrix, p, arrays[0]),
+        compiled_for("cuda", lambda *x: PANDA.regressor(jid.Motion(*x)), *arrays),
+    ]
+    for text in texts:
+        assert text.count(KERNEL) == text.count("custom_call") == 2
+        for operation in ("transpose", "sine", "optimization_barrier", "concatenate"):
+            assert f"stablehlo.{operation}" not in text
+
+
+@lowers_without_gpu
+@pytest.mark.parametrize("dtype", [np.float64, np.float32])
+def test_xla_transposes_each_input_once(dtype, has_gpu):
+    """Results that XLA computes are stacked in place, in either precision."""
+    p, *arrays = (x.astype(dtype) for x in numbers(PANDA, 300))
+    text = compiled_for("cuda", PANDA.mass_matrix, p, arrays[0])
+    assert text.count("stablehlo.transpose") == 1
+    text = compiled_for("cuda", lambda *x: PANDA.regressor(jid.Motion(*x)), *arrays)
+    assert text.count("stablehlo.transpose") == 3
+    assert "callback" not in text
 
 
 @lowers_without_gpu
@@ -217,6 +265,21 @@ def test_each_device_of_a_mesh_gets_one_kernel(has_gpu):
     assert compiled_for("cuda", on_mesh, *arrays).count(KERNEL) == 1
     divided = [jax.device_put(x, NamedSharding(mesh, spec)) for x in arrays]
     assert compiled_for("cuda", ARM.inverse_dynamics, p, *divided).count(KERNEL) == 1
+
+
+@lowers_without_gpu
+def test_each_device_of_a_mesh_places_its_results(has_gpu, places_results):
+    _, *arrays = numbers(ARM, 300)
+    spec = PartitionSpec("d")
+    mesh = Mesh(np.array(jax.devices()[:1]), ("d",))
+
+    def regressor(*arrays):
+        return ARM.regressor(jid.Motion(*arrays))
+
+    on_mesh = jax.shard_map(regressor, mesh=mesh, in_specs=spec, out_specs=spec)
+    assert compiled_for("cuda", on_mesh, *arrays).count(KERNEL) == 2
+    divided = [jax.device_put(x, NamedSharding(mesh, spec)) for x in arrays]
+    assert compiled_for("cuda", regressor, *divided).count(KERNEL) == 2
 
 
 def test_many_results_and_long_programs_are_left_to_xla(has_gpu):
