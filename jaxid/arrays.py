@@ -186,10 +186,10 @@ def in_parts(solve: Callable[[Any], Any], data: Any, size: int = 16) -> Any:
 
     XLA leaves small operations to one core, so each core gets entries of its own. Parts
     of equal size also mean that another number of entries compiles nothing anew. An
-    accelerator takes all entries at once, from where they are.
+    accelerator takes all entries at once; what lies there already is not moved.
     """
     if jax.default_backend() != "cpu":
-        return solve(data)
+        return solve(jax.device_put(data))
     data = jax.tree.map(np.asarray, data)
     count = len(jax.tree.leaves(data)[0])
     size = min(count, size)

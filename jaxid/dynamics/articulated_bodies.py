@@ -94,9 +94,9 @@ def rigid_body_accelerations(
             body = _free_body(p[i], motions[i].w)
         with jax.named_scope(f"articulated_{i}"):
             body = _sum(body, loads[i])
-            directions = _directions(robot, i)
+            direction = _direction(robot, i)
             answers[i], body = _through_joint(
-                body, motions[i], directions, rotors[i], forces[i]
+                body, motions[i], direction, rotors[i], forces[i]
             )
             parent = robot.parent[i]
             if parent >= 0:
@@ -139,37 +139,69 @@ def _free_body(p: AnyArray, w: Vector3) -> ArticulatedBody:
     return ArticulatedBody(p[0] * np.eye(3), -skew(h), J, force, moment)
 
 
-def _directions(robot: Robot, i: int) -> tuple[AnyArray, AnyArray]:
-    """Return the axis of a joint that slides, and that of a joint that turns."""
+class Direction(NamedTuple):
+    """Acceleration of a body for a unit acceleration of its joint.
+
+    Attributes:
+        a: Axis of a joint that slides, else zero.
+        wd: Axis of a joint that turns, else zero.
+    """
+
+    a: Vector3
+    wd: Vector3
+
+
+def _direction(robot: Robot, i: int) -> Direction:
+    """Return the direction of a joint."""
     axis = robot.axis[i]
     zero = np.zeros(3)
-    return (zero, axis) if robot.turns[i] else (axis, zero)
+    return Direction(zero, axis) if robot.turns[i] else Direction(axis, zero)
 
 
 def _through_joint(
     body: ArticulatedBody,
     motion: RelativeMotion,
-    directions: tuple[AnyArray, AnyArray],
+    direction: Direction,
     rotor: AnyArray,
     joint_force: AnyArray,
 ) -> tuple[JointAnswer, ArticulatedBody]:
     """Return the answer of a joint, and the body as its parent feels it."""
-    M, L, N, f, n = body
-    s_a, s_w = directions
-    # Wrench for a unit acceleration of the joint.
-    u_f = M @ s_a + L @ s_w
-    u_n = L.T @ s_a + N @ s_w
-    inertia = s_a @ u_f + s_w @ u_n + rotor
-    e = (joint_force - s_a @ f - s_w @ n) / inertia
-    k_a = u_f / inertia
-    k_w = u_n / inertia
+    force, moment = _wrench(body, direction.a, direction.wd)
+    inertia = _power(direction, force, moment) + rotor
+    rest_force = _power(direction, body.f, body.n)
+    answer = JointAnswer(
+        e=(joint_force - rest_force) / inertia,
+        k_a=force / inertia,
+        k_w=moment / inertia,
+    )
     # The joint gives way: it takes its direction out of the inertia.
-    M = symmetric(M - _outer(u_f, k_a))
-    L = L - _outer(u_f, k_w)
-    N = symmetric(N - _outer(u_n, k_w))
-    f = f + u_f * e + M @ motion.a + L @ motion.wd
-    n = n + u_n * e + L.T @ motion.a + N @ motion.wd
-    return JointAnswer(e, k_a, k_w), ArticulatedBody(M, L, N, f, n)
+    M_lost = _outer(force, answer.k_a)
+    L_lost = _outer(force, answer.k_w)
+    N_lost = _outer(moment, answer.k_w)
+    remainder = ArticulatedBody(
+        M=symmetric(body.M - M_lost),
+        L=body.L - L_lost,
+        N=symmetric(body.N - N_lost),
+        f=body.f + force * answer.e,
+        n=body.n + moment * answer.e,
+    )
+    # Speeds accelerate the body without its joint.
+    speed_force, speed_moment = _wrench(remainder, motion.a, motion.wd)
+    f = remainder.f + speed_force
+    n = remainder.n + speed_moment
+    return answer, remainder._replace(f=f, n=n)
+
+
+def _wrench(body: ArticulatedBody, a: Vector3, wd: Vector3) -> tuple[Vector3, Vector3]:
+    """Return force and moment that accelerations take, beside those without any."""
+    force = body.M @ a + body.L @ wd
+    moment = body.L.T @ a + body.N @ wd
+    return force, moment
+
+
+def _power(direction: Direction, force: Vector3, moment: Vector3) -> AnyArray:
+    """Return the part of a force and a moment that a joint feels."""
+    return direction.a @ force + direction.wd @ moment
 
 
 def _in_parent(body: ArticulatedBody, motion: RelativeMotion) -> ArticulatedBody:
@@ -207,9 +239,9 @@ def _accelerations(
             wd = R.T @ wd + motions[i].wd
             e, k_a, k_w = answers[i]
             accelerations[i] = e - k_a @ a - k_w @ wd
-            s_a, s_w = _directions(robot, i)
-            a = a + s_a * accelerations[i]
-            wd = wd + s_w * accelerations[i]
+            direction = _direction(robot, i)
+            a = a + direction.a * accelerations[i]
+            wd = wd + direction.wd * accelerations[i]
         body_accelerations[i] = (a, wd)
     return jnp.stack(accelerations)
 

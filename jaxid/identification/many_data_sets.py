@@ -169,7 +169,7 @@ def _solve_again(
     row_time: float | None,
 ) -> BatchFit:
     """Solve data sets that are not well conditioned by `identify`, on all cores."""
-    numbers = np.flatnonzero(~np.asarray(fit.determined))
+    numbers = np.flatnonzero(~jax.device_get(fit.determined))
     if not len(numbers):
         # Nothing else leaves the device.
         return fit

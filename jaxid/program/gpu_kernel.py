@@ -152,10 +152,7 @@ def _call_kernel(
 
     def kernel(*references):
         *columns, results = references
-        start = BLOCK * jnp.asarray(pallas.program_id(0), int)
-        positions = start + jnp.arange(BLOCK)
-        # Threads beyond the last sample compute it again.
-        samples = jnp.minimum(positions, count - 1)
+        samples = _members(pallas.program_id(0), BLOCK, count)
         values: dict[int, Array] = {}
         for position in positions_by_use:
             node = program.nodes[position]
@@ -188,15 +185,12 @@ def _placed(rows: Array, numbers: Array, constants: Array, interpret: bool) -> A
     entries = len(numbers)
 
     def kernel(rows, numbers, constants, results):
-        tile = jnp.arange(TILE)
-        first_sample = TILE * jnp.asarray(pallas.program_id(0), int)
-        first_entry = TILE * jnp.asarray(pallas.program_id(1), int)
-        # Threads beyond the last ones place them again.
-        sample = jnp.minimum(first_sample + tile, samples - 1)[:, None]
-        entry = jnp.minimum(first_entry + tile, entries - 1)
+        sample = _members(pallas.program_id(0), TILE, samples)[:, None]
+        entry = _members(pallas.program_id(1), TILE, entries)
         number = numbers[entry][None]
+        constant = constants[entry][None]
         values = rows[jnp.maximum(number, 0), sample]
-        placed_values = jnp.where(number >= 0, values, constants[entry][None])
+        placed_values = jnp.where(number >= 0, values, constant)
         results[sample, entry[None]] = placed_values
 
     call = pallas.pallas_call(
@@ -207,6 +201,15 @@ def _placed(rows: Array, numbers: Array, constants: Array, interpret: bool) -> A
         interpret=interpret,
     )
     return call(rows, numbers, constants)
+
+
+def _members(block: Array, size: int, count: int) -> Array:
+    """Return the numbers of the members of a block; those too many are the last one.
+
+    Threads compute the last one again.
+    """
+    members = size * jnp.asarray(block, int) + jnp.arange(size)
+    return jnp.minimum(members, count - 1)
 
 
 def _alike(x: Array, shape: Shape) -> jax.ShapeDtypeStruct:

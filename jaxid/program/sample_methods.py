@@ -142,6 +142,7 @@ class FormLimits(NamedTuple):
 
     Attributes:
         piece: Operations up to which a program is compiled in one piece.
+        rows: Operations and results up to which rows of samples are.
         repetition: Ratio of operations from which loops over equal parts pay: each turn
             moves values to and fro.
         program: Operations above which loops are taken for any repetition, or the
@@ -149,8 +150,9 @@ class FormLimits(NamedTuple):
     """
 
     piece: int = 4000
+    rows: int = 5000
     repetition: float = 8
-    program: int = 8000
+    program: int = 6000
 
 
 LIMITS = FormLimits()
@@ -190,13 +192,13 @@ class SampleMethod:
             if program is not None:
                 return program
         program = trace(self.definition, *self.shapes)
-        is_method = getattr(self.definition, "__self__", None) is self.owner
-        if program.counts.total <= LIMITS.piece or not is_method:
-            return program
-        return self._in_loops(program)
+        is_short = program.counts.total <= LIMITS.piece
+        return program if is_short else self._in_loops(program)
 
     def _in_loops(self, program: Program) -> Program:
         """Return a long program with the loops over its equal parts."""
+        if getattr(self.definition, "__self__", None) is not self.owner:
+            return program
         model, numbers = with_open_numbers(self.owner, self.definition.__name__)
         open_program = trace(model.call, numbers.shape, *self.shapes)
         loops = find_equal_parts(open_program, numbers)
@@ -204,6 +206,17 @@ class SampleMethod:
         if loops is None or (is_short and loops.repetition < LIMITS.repetition):
             return program
         return dataclasses.replace(program, loops=loops)
+
+    @functools.cached_property
+    def _rows(self) -> Program:
+        """Program of rows of samples, in loops if it has many results.
+
+        Memory for many results takes longer than the loops.
+        """
+        size = self.program.counts.total + len(self.program.outputs)
+        if self.program.loops is not None or size <= LIMITS.rows:
+            return self.program
+        return self._in_loops(self.program)
 
     @functools.cached_property
     def spatial_definition(self) -> Callable:
@@ -231,8 +244,7 @@ class SampleMethod:
         method = functools.partial(definition_on_rows, self.spatial_definition)
         if not self.is_long:
             # The program is the fastest; its derivatives are those of the spatial form.
-            program = functools.partial(on_rows, self.program)
-            method = with_derivatives_of(method, program)
+            method = with_derivatives_of(method, functools.partial(on_rows, self._rows))
         return lambda *arrays: method(*arrays).reshape(-1, *self.output_shape)
 
     @functools.cached_property

@@ -1,6 +1,7 @@
 """The public dynamics of many samples: by blocks, transformed, on all platforms."""
 
 import dataclasses
+import re
 
 import jax
 import jax.numpy as jnp
@@ -12,6 +13,7 @@ import jaxid as jid
 from jaxid.dynamics.motion import Motion
 from jaxid.program import sample_methods
 from jaxid.program.sample_methods import in_numpy, program_of, spatial_form
+from jaxid.program.xla_sample_blocks import BLOCK_OF_PRODUCTS, BLOCK_ON_GPU
 
 MODEL = jid.Model(jid.robots.planar_arm())
 P = np.random.default_rng(0).uniform(0.5, 1.0, MODEL.size)
@@ -139,6 +141,23 @@ def test_a_gpu_gets_no_fences_and_no_host_callbacks(name):
     assert "callback" not in traced.lower(lowering_platforms=("cpu",)).as_text()
     # What is stacked is computed before, and what is multiplied is not stored.
     assert text.count("stablehlo.optimization_barrier") == (name != "gram")
+
+
+def test_gram_stores_no_columns_of_all_samples():
+    count = 2 * BLOCK_ON_GPU
+    x = in_jax(motion(count))
+    traced = jax.jit(MODEL.gram).trace(x)
+    text = traced.lower(lowering_platforms=("cuda",)).as_text()
+    shapes = re.findall(r"tensor<([0-9x]+)xf64>", text)
+    assert {shape for shape in shapes if str(count) in shape.split("x")} == {
+        f"{count}x2"
+    }
+    # On a CPU temporaries do not grow with the samples.
+    sizes = []
+    for samples in (2 * BLOCK_OF_PRODUCTS, 8 * BLOCK_OF_PRODUCTS):
+        compiled = jax.jit(MODEL.gram).lower(x[:samples]).compile()
+        sizes.append(compiled.memory_analysis().temp_size_in_bytes)
+    assert sizes[1] == sizes[0]
 
 
 @pytest.mark.parametrize("seed", range(4))

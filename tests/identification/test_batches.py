@@ -1,5 +1,6 @@
 """Batches give what one identification after the other gives."""
 
+import math
 import re
 
 import equinox as eqx
@@ -86,7 +87,18 @@ def test_a_gpu_takes_all_data_sets_from_where_they_are(monkeypatch):
     monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
     in_parts(calls.append, x)
     (given,) = calls
-    assert given is x
+    assert given.unsafe_buffer_pointer() == x.unsafe_buffer_pointer()
+
+
+def test_a_gpu_gets_and_gives_nothing_unasked(base, arrays, monkeypatch):
+    """Every implicit way of an array to a device or from it is an error here."""
+    device_arrays = jax.tree.map(jnp.asarray, arrays)
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    # What is compiled may hold constants.
+    expected = identify_batch(base, *device_arrays)
+    with jax.transfer_guard("disallow"):
+        found = identify_batch(base, *device_arrays)
+    np.testing.assert_array_equal(found.parameters, expected.parameters)
 
 
 def test_only_the_mark_of_good_data_sets_leaves_a_gpu(base, arrays, monkeypatch):
@@ -232,6 +244,13 @@ def test_a_gpu_solves_many_data_sets_at_once_without_callbacks(base):
     assert 7 in trips["cuda"]
     assert 500 not in trips["cuda"]
     assert "callback" not in texts["cuda"]
+    # Columns [samples, columns] of one group at a time are in memory.
+    shapes = re.findall(r"tensor<([0-9x]+)xf64>", texts["cuda"])
+    sizes = {math.prod(map(int, shape.split("x"))) for shape in shapes}
+    columns = max(map(len, base.acting_columns))
+    all_inputs = 7 * 143 * 800 * 2
+    assert max(sizes) <= max(2**17 * columns, all_inputs)
+    assert 1000 * 800 * columns > max(sizes)
     # Fences are divisions.
     assert texts["cuda"].count("stablehlo.divide") < 0.5 * texts["cpu"].count(
         "stablehlo.divide"
