@@ -62,6 +62,7 @@ SPEED = (
     Script("python_loop", 2),
     Script("batches", 2),
     Script("scaling", 8),
+    Script("large_trees", 12),
     Script("gpu", 2),
 )
 METHODS = (
