@@ -100,17 +100,12 @@ class BlockResults(NamedTuple):
         if not isinstance(self.values, tuple):
             rows = rows_of(self.program, self.values, np.array(positions, int))
             return rows if axis == 0 else rows.T
-        columns = self.columns(positions)
-        return jnp.stack(columns, axis) if columns else self.row[:0, None]
-
-    def columns(self, positions: Sequence[int]) -> list[Array]:
-        """Return some entries of the packed result, from distinct results."""
         values = self.program.pack(self.values)
         columns = []
         for k in positions:
             column = jnp.asarray(values[k], self.row.dtype)
             columns.append(jnp.broadcast_to(column, self.row.shape))
-        return columns
+        return jnp.stack(columns, axis) if columns else self.row[:0, None]
 
     def packed(self) -> Rows:
         """Return the packed result of each sample."""
@@ -134,15 +129,6 @@ def _evaluate_at_once(
     """Return the results of many samples, without fences."""
     results = results_at_once(program, *arrays)
     return BlockResults(program, results, arrays[-1][:, 0]), memory
-
-
-def samples_results(program: Program, *arrays: Array) -> BlockResults:
-    """Return the results of a block on a CPU, whose loops run on shorter blocks."""
-    if program.loops is None:
-        values = block_results(program, *arrays)
-    else:
-        values = tuple(distinct_rows(program, *arrays))
-    return BlockResults(program, values, arrays[-1][:, 0])
 
 
 def _over_blocks(
