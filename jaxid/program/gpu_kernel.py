@@ -95,7 +95,7 @@ def in_kernel(
         if not is_placed:
             return _results(program, inputs, interpret)
         rows = _distinct_rows(program, inputs, interpret)
-        return _placed(rows, *tables_on_device, interpret)
+        return _placed(rows, *tables_on_device, interpret=interpret)
 
     if jax.sharding.get_abstract_mesh().manual_axes:
         # `shard_map` has divided the arrays already.
@@ -176,7 +176,7 @@ def _call_kernel(
     return call(*inputs)
 
 
-def _placed(rows: Array, numbers: Array, constants: Array, interpret: bool) -> Array:
+def _placed(rows: Array, numbers: Array, constants: Array, *, interpret: bool) -> Array:
     """Return the packed results of samples from their distinct results."""
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
