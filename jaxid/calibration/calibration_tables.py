@@ -14,8 +14,6 @@ from jaxid.result_table import (
     significant,
 )
 
-from .corrections import undetermined_corrections
-
 if TYPE_CHECKING:
     from .geometry_fit import GeometryFit
 
@@ -28,6 +26,10 @@ DISPLAY_UNITS = {
 """Factors and names of the units of corrections in tables."""
 
 
+MIN_FACTOR = 1e-3
+"""Smallest share of a column in another one that is worth a word."""
+
+
 def in_thousandths(value: float) -> str:
     """Return a number with three decimals, and a dash for NaN."""
     return MISSING if math.isnan(value) else f"{value:z.3f}"
@@ -35,34 +37,25 @@ def in_thousandths(value: float) -> str:
 
 def session_table(fit: "GeometryFit") -> Table:
     """Return mean errors of the poses of each session and place, before and after."""
-    places = fit.problem.poses_of_places
-    poses = list(places.values())
+    is_pose = fit.problem.poses.is_pose
+    names = fit.problem.place_names
+    places = list(dict.fromkeys(names[is_pose].tolist()))
+    poses = [np.flatnonzero(is_pose & (names == place)) for place in places]
     columns = [
-        Column("session", [session for session, _ in places]),
-        Column("place", [place for _, place in places]),
+        Column("session, place", places),
         Column("poses", [len(x) for x in poses]),
         Column("left out", [int(fit.solution.is_wrong[x].sum()) for x in poses]),
     ]
-    sizes = {"nominal": fit.nominal_errors, "calibrated": fit.errors}
-    if fit.can_hold_out:
-        calibrated, nominal = fit.held_out[:2]
-        sizes = {"nominal,\nheld out": nominal, "calibrated": fit.errors}
-        sizes["calibrated,\nheld out"] = calibrated
+    sizes = {"nominal": fit.shown_errors.nominal}
+    sizes["calibrated"] = fit.shown_errors.calibrated
     for words, errors in sizes.items():
         means = [1e3 * errors.lengths[x].mean() for x in poses]
         columns.append(Column(words, means, "mm"))
         if np.isfinite(errors.angles).any():
             angles = [np.rad2deg(np.nanmean(errors.angles[x])) for x in poses]
             columns.append(Column(words, angles, "deg"))
-    remark = (
-        "Held out: the calibration has not seen the session; all poses count, also "
-        "those that it leaves out as wrong."
-    )
-    return Table(
-        "mean errors of the poses of each session",
-        *columns,
-        remarks=[remark] if fit.can_hold_out else [],
-    )
+    remark = "All poses count, also those that are left out as wrong."
+    return Table(f"mean errors, {fit.manner}", *columns, remarks=[remark])
 
 
 def correction_table(fit: "GeometryFit") -> Table:
@@ -127,9 +120,17 @@ def combination_table(fit: "GeometryFit") -> Table:
 
 def undetermined_table(fit: "GeometryFit") -> Table:
     """Return the corrections that the poses cannot tell from others."""
-    rows = undetermined_corrections(fit.corrections, fit.combinations)
+    combinations = fit.combinations
+    leaders = np.array(combinations.leaders)
+    words = [correction.words for correction in fit.corrections]
+    partners = []
+    for factors in combinations.factors.T:
+        sizes = np.abs(factors)
+        is_part = sizes > MIN_FACTOR * sizes.max(initial=0.0)
+        names = [words[leader] for leader in leaders[is_part]]
+        partners.append(", ".join(names) or "nothing: it has no effect")
     return Table(
         "corrections that the poses cannot tell from others",
-        Column("correction", [words for words, _ in rows]),
-        Column("not told from", [x or "nothing: it has no effect" for _, x in rows]),
+        Column("correction", [words[follower] for follower in combinations.followers]),
+        Column("not told from", partners),
     )

@@ -14,7 +14,6 @@ from jaxid.dynamics.rank import (
     gram_schmidt,
     regrouping,
 )
-from jaxid.robot.robot import Robot
 
 from .adjustment import session_equations
 from .problem import CalibrationProblem, Linearisation
@@ -22,8 +21,6 @@ from .problem import CalibrationProblem, Linearisation
 AXES = "xyz"
 MIN_SHARE = 1e-7
 """Share of a column that those before it must leave unexplained."""
-MIN_FACTOR = 1e-3
-"""Smallest share of a column in another one that is worth a word."""
 
 
 class Correction(NamedTuple):
@@ -33,6 +30,8 @@ class Correction(NamedTuple):
     kind: str  # zero (a turn about the joint's axis), shift, turn or compliance
     axis: str  # its direction in words; empty for a compliance or a zero
     unit: str  # of its value
+    # Of two that poses cannot tell apart, the one with the smaller rank names both.
+    rank: int
 
     @property
     def group(self) -> str:
@@ -78,29 +77,34 @@ class Combinations(NamedTuple):
 
 
 def common_corrections(problem: CalibrationProblem) -> list[Correction]:
-    """Return the corrections that all sessions share, in the order of their columns."""
+    """Return the corrections that all sessions share, in the order of their columns.
+
+    Tools rank first, then compliances, the zeros of joints, shifts and turns across the
+    axes, and last the shifts along axes.
+    """
     robot = problem.robot
-    turns = robot.turns[: robot.joints]
     corrections = []
     for name, axis in zip(robot.body_names, robot.axis, strict=True):
-        of_joint = _of_frame(name)
-        if np.abs(axis).max() == 1.0:
-            number = 3 + int(np.argmax(np.abs(axis)))
-            of_joint[number] = Correction(name, "zero", "", "rad")
+        of_joint = _of_frame(name, 3)
+        main = int(np.argmax(np.abs(axis)))
+        of_joint[main] = of_joint[main]._replace(rank=4)
+        of_joint[3 + main] = of_joint[3 + main]._replace(rank=2)
+        if abs(axis[main]) == 1.0:
+            of_joint[3 + main] = Correction(name, "zero", "", "rad", 2)
         corrections += of_joint
-    for name, does_turn in zip(robot.joint_names, turns, strict=True):
+    for name, does_turn in zip(robot.joint_names, robot.turns, strict=False):
         unit = "rad/(N m)" if does_turn else "m/N"
-        corrections.append(Correction(name, "compliance", "", unit))
+        corrections.append(Correction(name, "compliance", "", unit, 1))
     for session, name in problem.frame_keys:
         if not session:
-            corrections += _of_frame(name)
+            corrections += _of_frame(name, 0)
     return corrections
 
 
-def _of_frame(name: str) -> list[Correction]:
+def _of_frame(name: str, rank: int) -> list[Correction]:
     """Return the corrections of a frame."""
-    shifts = [Correction(name, "shift", f"along {axis}", "m") for axis in AXES]
-    turns = [Correction(name, "turn", f"about {axis}", "rad") for axis in AXES]
+    shifts = [Correction(name, "shift", f"along {x}", "m", rank) for x in AXES]
+    turns = [Correction(name, "turn", f"about {x}", "rad", rank) for x in AXES]
     return shifts + turns
 
 
@@ -122,7 +126,8 @@ def determined_combinations(
     blocks = [np.linalg.qr(x.jacobian, mode="r") for x in equations]
     columns = np.concatenate(blocks) * scales[common]
 
-    order = _order(problem.robot, len(common))
+    ranks = [correction.rank for correction in common_corrections(problem)]
+    order = np.argsort(ranks, kind="stable")
     order = order[scales[common][order] > 0.0]
     ordered_columns = columns[:, order]
     dependence = gram_schmidt(ordered_columns, MIN_SHARE)
@@ -138,39 +143,3 @@ def determined_combinations(
     return Combinations(
         tuple(leaders.tolist()), tuple(followers.tolist()), factors, gap
     )
-
-
-def _order(robot: Robot, size: int) -> np.ndarray:
-    """Return the columns in the order in which they name combinations.
-
-    Tools come first, then compliances, the zeros of joints, shifts and turns across the
-    axes, and last the shifts along axes: of two that poses cannot tell apart, the
-    earlier one names the combination.
-    """
-    bodies = robot.bodies
-    main_axes = np.argmax(np.abs(robot.axis), axis=1)
-    ranks = np.full(size, 0)
-    ranks[: 6 * bodies] = 3
-    first_columns = 6 * np.arange(bodies)
-    ranks[first_columns + 3 + main_axes] = 2
-    ranks[first_columns + main_axes] = 4
-    ranks[6 * bodies : 6 * bodies + robot.joints] = 1
-    return np.argsort(ranks, kind="stable")
-
-
-def undetermined_corrections(
-    corrections: list[Correction], combinations: Combinations
-) -> list[tuple[str, str]]:
-    """Return corrections that poses cannot tell, and those they cannot tell them from.
-
-    The second text is empty for corrections without effect on the errors.
-    """
-    rows = []
-    for follower, factors in zip(
-        combinations.followers, combinations.factors.T, strict=True
-    ):
-        is_part = np.abs(factors) > MIN_FACTOR * np.abs(factors).max(initial=0.0)
-        leaders = np.array(combinations.leaders)[is_part]
-        partners = ", ".join(corrections[leader].words for leader in leaders)
-        rows.append((corrections[follower].words, partners))
-    return sorted(rows, key=lambda row: bool(row[1]))

@@ -171,12 +171,6 @@ class GeometryFit(Summarised):
         """Errors of all poses with the calibrated geometry."""
         return self.problem.error_sizes(self.solution.adjustment.linearisation.errors)
 
-    @cached_property
-    def nominal_errors(self) -> ErrorSizes:
-        """Errors of all poses with the nominal geometry, tool and places fitted."""
-        errors = nominal_solution_errors(self.problem, self.solution.weights)
-        return self.problem.error_sizes(errors)
-
     @property
     def can_hold_out(self) -> bool:
         """Whether there are enough sessions to hold each out in turn."""
@@ -209,12 +203,14 @@ class GeometryFit(Summarised):
             )
         return held_out_errors(self.problem, self.has_compliance)
 
-    @property
+    @cached_property
     def shown_errors(self) -> HeldOutErrors:
         """Errors of sessions that are held out if there are enough, or of the fit."""
         if self.can_hold_out:
             return self.held_out
-        return HeldOutErrors(self.errors, self.nominal_errors, np.zeros(0))
+        errors = nominal_solution_errors(self.problem, self.solution.weights)
+        nominal = self.problem.error_sizes(errors)
+        return HeldOutErrors(self.errors, nominal, np.zeros(0))
 
     @property
     def manner(self) -> str:

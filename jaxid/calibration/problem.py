@@ -93,17 +93,6 @@ class CalibrationProblem:
             for session in range(len(self.sessions))
         ]
 
-    @property
-    def poses_of_places(self) -> dict[tuple[str, str], np.ndarray]:
-        """Indices of the poses of each place, by the names of session and place."""
-        poses = self.poses
-        rows: dict[tuple[str, str], list[int]] = {}
-        for pose in np.flatnonzero(poses.is_pose):
-            _, place = self.frame_keys[poses.place[pose]]
-            key = (self.sessions[poses.session[pose]], place)
-            rows.setdefault(key, []).append(int(pose))
-        return {key: np.array(numbers) for key, numbers in rows.items()}
-
     @cached_property
     def session_columns(self) -> list[np.ndarray]:
         """Columns of the frames that belong to each session alone."""
@@ -124,13 +113,18 @@ class CalibrationProblem:
         return np.setdiff1d(np.arange(self.nominal.vector.size), session_columns)
 
     @property
+    def place_names(self) -> np.ndarray:
+        """Session and place of each pose."""
+        pairs = zip(self.poses.session, self.poses.place, strict=True)
+        return np.array(
+            [f"{self.sessions[x]}, {self.frame_keys[place][1]}" for x, place in pairs]
+        )
+
+    @property
     def pose_names(self) -> list[str]:
         """Session, place and number of each pose."""
-        names = ["" for _ in self.poses.number]
-        for (session, place), rows in self.poses_of_places.items():
-            for row in rows:
-                names[row] = f"{session}, {place}, pose {self.poses.number[row]}"
-        return names
+        pairs = zip(self.place_names, self.poses.number, strict=True)
+        return [f"{place}, pose {number}" for place, number in pairs]
 
     def error_sizes(self, errors: Float[np.ndarray, "poses 6"]) -> ErrorSizes:
         """Return the lengths and angles of the errors of each pose.

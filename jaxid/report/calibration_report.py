@@ -54,8 +54,7 @@ class CalibrationReport(RunsReport):
 
     def overview(self) -> list:
         """Return verdict, findings and errors of the sessions."""
-        _, sessions = self.result.overview()
-        return [Table("", remarks=self.findings), sessions]
+        return [Table("", remarks=self.findings), self.details[0]]
 
     def save(self, folder: FilePath) -> list[Path]:
         """Write page, numbers, poses to record, and the robot's file."""
@@ -203,33 +202,15 @@ def _answer(fit: GeometryFit) -> Answer:
         f"{fit.problem.robot.name}: calibrated geometry",
         fit.verdict.text,
         numbers,
-        [pose_error_figure(fit), workspace_figure(fit)],
+        [workspace_figure(fit)],
         HOW_TO_READ,
     )
 
 
-def pose_error_figure(fit: GeometryFit) -> Figure:
-    """Return the error of every pose before and after, a panel for each session."""
-    errors = fit.shown_errors
-    panels = []
-    for session, poses in zip(
-        fit.problem.sessions, fit.problem.poses_of_sessions, strict=True
-    ):
-        numbers = np.arange(1, len(poses) + 1)
-        curves = [
-            Curve(numbers, 1e3 * x.lengths[poses], name, colour, kind="points")
-            for x, name, colour in (
-                (errors.nominal, "nominal", GREY),
-                (errors.calibrated, "calibrated", BLUE),
-            )
-        ]
-        panels.append(Panel(curves, session, x="pose", y="error", unit="mm", log="y"))
-    return Figure(f"error of every pose, {fit.manner}", panels, columns=2)
-
-
 def workspace_figure(fit: GeometryFit) -> Figure:
-    """Return where in the workspace errors are left, from above and from the side."""
+    """Return the error of every pose in the workspace, before and after."""
     poses = fit.problem.poses
+    names = np.array(fit.problem.pose_names)[poses.is_pose]
     points = tip_jacobian(fit.problem.robot, poses.q[poses.is_pose]).position
     panels = []
     for title, errors in (
@@ -239,18 +220,19 @@ def workspace_figure(fit: GeometryFit) -> Figure:
         lengths = errors.lengths[poses.is_pose]
         for view, axes in (("from above", (0, 1)), ("from the side", (0, 2))):
             labels = [f"{'xyz'[axis]} [m]" for axis in axes]
-            curves = _classes(points[:, axes], lengths)
+            curves = _classes(points[:, axes], lengths, names)
             panels.append(Panel(curves, f"{title}, {view}", x=labels[0], y=labels[1]))
     return Figure(f"errors in the workspace, {fit.manner}", panels, columns=2)
 
 
-def _classes(places: np.ndarray, lengths: Vector) -> list[Curve]:
+def _classes(places: np.ndarray, lengths: Vector, names: np.ndarray) -> list[Curve]:
     """Return the poses of each class of errors as points."""
     classes = np.searchsorted(np.quantile(lengths, QUANTILES), lengths)
     curves = []
     for number, (name, colour) in enumerate(CLASSES.items()):
         poses = classes == number
         x, y = places[poses].T
-        texts = [f"{length:.2f} mm" for length in 1e3 * lengths[poses]]
+        pairs = zip(names[poses], 1e3 * lengths[poses], strict=True)
+        texts = [f"{name}: {length:.3g} mm" for name, length in pairs]
         curves.append(Curve(x, y, name, colour, kind="points", texts=texts))
     return curves
