@@ -14,7 +14,4 @@ from .observations import (
     PointContact as PointContact,
     SocketDistance as SocketDistance,
 )
-from .pose_proposals import (
-    ProposedSession as ProposedSession,
-    propose_sessions as propose_sessions,
-)
+from .pose_proposals import propose_sessions as propose_sessions

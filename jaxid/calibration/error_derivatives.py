@@ -84,14 +84,12 @@ class PoseErrors(NamedTuple):
         by_geometry: Derivatives by origins, then by compliances.
         by_tool: Derivatives by the correction of the tool.
         by_place: Derivatives by the correction of the place.
-        seen: Poses of the tools in their places.
     """
 
     values: Float[np.ndarray, "poses 6"]
     by_geometry: Float[np.ndarray, "poses 6 unknowns"]
     by_tool: Float[np.ndarray, "poses 6 6"]
     by_place: Float[np.ndarray, "poses 6 6"]
-    seen: Frame
 
 
 def corrected_robot(robot: Robot, origins: Float[np.ndarray, "bodies 6"]) -> Robot:
@@ -156,7 +154,6 @@ def pose_errors(
         slopes @ by_geometry,
         slopes @ by_tool,
         -slopes @ by_place,
-        seen,
     )
 
 

@@ -5,6 +5,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from jaxid.arrays import AnyArray, Texts, Vector
 from jaxid.errors import InputError
@@ -146,6 +147,17 @@ class GeometryFit(Summarised):
     def dof(self) -> int:
         """Degrees of freedom of the intervals: sessions less one."""
         return len(self.problem.sessions) - 1
+
+    @property
+    def next_narrowing(self) -> float:
+        """Share by which one more session like these narrows the intervals (0 to 1).
+
+        Their widths are those of means of as many sessions.
+        """
+        sessions = np.array([0, 1]) + max(self.dof + 1, 2)
+        quantiles = scipy.special.stdtrit(sessions - 1, 0.975)
+        before, after = quantiles / np.sqrt(sessions)
+        return float(1.0 - after / before)
 
     @cached_property
     def uncertainty(self) -> Uncertainty:

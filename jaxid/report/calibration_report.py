@@ -7,7 +7,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.arrays import Vector
-from jaxid.calibration import GeometryFit, ProposedSession, propose_sessions
+from jaxid.calibration import GeometryFit, propose_sessions
+from jaxid.calibration.pose_proposals import mean_place
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
 from jaxid.export.calibrated_origins import export_origins
@@ -106,7 +107,7 @@ def calibration_report(
     )
 
 
-def _proposals(fit: GeometryFit, clearance: Clearance | None) -> list[ProposedSession]:
+def _proposals(fit: GeometryFit, clearance: Clearance | None) -> list[np.ndarray]:
     """Return sessions to record next; none if the tool reaches no place."""
     try:
         return propose_sessions(fit, clearance=clearance)
@@ -115,7 +116,7 @@ def _proposals(fit: GeometryFit, clearance: Clearance | None) -> list[ProposedSe
 
 
 def _advice(
-    fit: GeometryFit, proposals: list[ProposedSession], clearance: Clearance | None
+    fit: GeometryFit, proposals: list[np.ndarray], clearance: Clearance | None
 ) -> list[str]:
     """Return which poses are missing, and whether more of them pay."""
     robot = fit.problem.robot
@@ -132,35 +133,29 @@ def _advice(
             "Postures are missing: of their ranges, the poses use little of "
             + ", ".join(narrow_joints)
         )
+    narrowing = fit.next_narrowing
+    sentence = f"One more session would narrow the intervals by {percent(narrowing)} %"
+    if narrowing < MIN_NARROWING:
+        sentence += ": more sessions hardly pay"
     if not proposals:
-        return [*sentences, "No place was found at which more poses could be recorded"]
+        return [*sentences, f"{sentence}; no place to record was found"]
     shapes = "not checked for collisions" if clearance is None else "without collision"
-    narrowings = [f"{percent(max(x.narrowing, 0.0))} %" for x in proposals]
-    poses = len(proposals[0].q)
-    sentence = (
-        f"Of more sessions with {poses} poses each, the next ones would narrow the "
-        f"intervals by {', '.join(narrowings)}: `poses_to_record.csv` "
-        f"(within limits, {shapes})"
+    where = [str(mean_place(fit, q).round(2).tolist()) for q in proposals]
+    sentences.append(
+        f"{sentence}; places far from the others are near {', '.join(where)} m: "
+        f"`poses_to_record.csv` (within limits, {shapes})"
     )
-    if proposals[0].narrowing < MIN_NARROWING:
-        sentence = (
-            "More sessions hardly pay: the best of those that were tried would narrow "
-            f"the intervals by {narrowings[0]}"
-        )
-    return [*sentences, sentence]
+    return sentences
 
 
-def _rows(
-    fit: GeometryFit, proposals: list[ProposedSession], units: Vector
-) -> list[Record]:
+def _rows(fit: GeometryFit, proposals: list[np.ndarray], units: Vector) -> list[Record]:
     """Return a row for each pose to record, with angles in the files' unit."""
-    names = fit.problem.robot.joint_names
-    rows = []
-    for session, proposal in enumerate(proposals, 1):
-        for q in proposal.q / units:
-            coordinates = dict(zip(names, q.tolist(), strict=True))
-            rows.append({"session": session, **coordinates})
-    return rows
+    names = ("session", *fit.problem.robot.joint_names)
+    return [
+        dict(zip(names, [session, *q], strict=True))
+        for session, poses in enumerate(proposals, 1)
+        for q in (poses / units).tolist()
+    ]
 
 
 def _content(fit: GeometryFit) -> Record:
