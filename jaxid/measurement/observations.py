@@ -310,7 +310,7 @@ class Observations(eqx.Module):
             if not part.mask.any(axis=0).all():
                 raise InputError(
                     f"`fraction` of {fraction:g} leaves no rows of some joint of "
-                    f"`{self.name}`."
+                    f"`{self.name}`: validate with another log (`--verify`)."
                 )
         return first_part, second_part
 

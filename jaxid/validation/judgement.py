@@ -1,15 +1,18 @@
 """The one judgement of a model: findings with a severity each, then the verdict."""
 
 import dataclasses
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
+from scipy import special
 
 from jaxid.dynamics.terms import ConstantOffset
 from jaxid.identification.fit_result import Fit
 from jaxid.result_table import Remark, Status, percent, significant, sort_remarks
 from jaxid.robot.collision_geometry import BodyShape
+from jaxid.robot.contacts import legs_of
 
 from .torque_errors import (
     Definiteness,
@@ -59,9 +62,20 @@ class PriceLimits(NamedTuple):
     bad: float = 1.0
 
 
+class LegLimits(NamedTuple):
+    """When the drives of legs that are built alike differ.
+
+    Simulated quadrupeds whose legs are equal were never said to differ.
+    """
+
+    chance: float = 0.01  # probability of a false alarm in a report
+    share: float = 0.25  # smaller differences, relative to the other legs, are usual
+
+
 ERRORS = ErrorLimits()
 GROWTH = GrowthLimits()
 PRICES = PriceLimits()
+LEGS = LegLimits()
 MAX_CONDITION_NUMBER = 1e3
 """Condition number (scaled columns) above which parameters are hard to tell apart."""
 MAX_OFFSET_SHARE = 0.3
@@ -164,6 +178,7 @@ def judge(report: Report) -> Judgement:
         _judge_mass_matrix(report.definiteness),
         *_judge_bounds(fit),
         *_judge_offsets(fit),
+        *_judge_legs(fit),
         *_judge_claims(report.claimed, report.fit.base.model.robot.joint_names),
         *_judge_friction(fit, report.identification),
         *_remarks_on_fit(report),
@@ -301,6 +316,76 @@ def _judge_offsets(fit: Fit) -> Iterator[Remark]:
                 Status.DOUBTFUL,
                 f"Good: up to {100 * MAX_OFFSET_SHARE:g} % of the largest force.",
             )
+
+
+def _judge_legs(fit: Fit) -> Iterator[Remark]:
+    """Compare the drives of equal joints of legs, which are usually built alike."""
+    robot = fit.base.model.robot
+    legs = legs_of(robot).own_joints if robot.contacts else ()
+    if len(legs) < 2 or len(set(map(len, legs))) > 1:
+        return
+    comparisons = _leg_comparisons(fit, legs)
+    limit = special.ndtri(1.0 - 0.5 * LEGS.chance / max(len(comparisons), 1))
+    differences = [
+        x
+        for x in comparisons
+        if abs(x.difference) > max(limit * x.deviation, LEGS.share * abs(x.others))
+    ]
+    for x in differences:
+        yield Remark(
+            f"Joint `{robot.joint_names[x.joint]}` differs from the same joint of the "
+            f"other legs: {x.meaning} is {significant(x.others + x.difference, 2)} and "
+            f"not {significant(x.others, 2)} {x.unit}; are the legs built alike?",
+            detail="The difference is larger than both intervals explain.",
+        )
+    if comparisons and not differences:
+        yield Remark(
+            "Friction and rotors of equal joints of the legs agree within their "
+            "intervals",
+            Status.GOOD,
+        )
+
+
+class LegComparison(NamedTuple):
+    """A parameter of a joint, compared with the same joint of the other legs."""
+
+    joint: int
+    meaning: str
+    unit: str
+    others: float  # median of the other legs
+    difference: float  # from this median
+    deviation: float  # standard deviation of the difference
+
+
+def _leg_comparisons(fit: Fit, legs: Sequence[Sequence[int]]) -> list[LegComparison]:
+    """Compare each identified parameter of the drives of legs with the other legs."""
+    robot = fit.base.model.robot
+    names = [*fit.base.names]
+    terms = fit.base.model.terms
+    parameters = [x for term in terms for x in term.joint_parameters if x.role]
+    comparisons = []
+    for parameter, joints in itertools.product(parameters, zip(*legs, strict=True)):
+        keys = [f"{parameter.name}{robot.numbers[joint]}" for joint in joints]
+        if not set(keys) <= set(names):
+            continue
+        places = [names.index(key) for key in keys]
+        values = np.asarray(fit.parameters)[places]
+        variances = fit.standard_deviations[places] ** 2
+        for k, joint in enumerate(joints):
+            # A median: one leg that differs does not make the others differ.
+            others = float(np.median(np.delete(values, k)))
+            variance = variances[k] + np.median(np.delete(variances, k))
+            comparisons.append(
+                LegComparison(
+                    joint,
+                    parameter.meaning.split(":")[0],
+                    fit.base.units[places[k]],
+                    others,
+                    float(values[k] - others),
+                    float(np.sqrt(variance)),
+                )
+            )
+    return comparisons
 
 
 def _judge_claims(

@@ -157,6 +157,42 @@ def test_wrong_signals_of_the_imu_are_named(dog, base, key, change, words):
     assert words in text
 
 
+def test_logs_of_legs_are_identified_and_equal_legs_compared(dog, base, tmp_path):
+    """The mass is right, and the joint whose friction is larger is named alone."""
+    folder, log = dog
+    speeds = np.gradient(log["angles"], STEP, axis=0)
+    friction = np.full(12, 0.3)
+    friction[4] = 1.0
+    tables = [
+        log["angles"],
+        log["forces"] + friction * speeds,
+        log["gyro"],
+        log["accelerometer"],
+        log["contact"],
+    ]
+    widths = {"q": 12, "tau": 12, "gyro": 3, "acc": 3, "contact": 4}
+    names = [f"{key}{k + 1}" for key, width in widths.items() for k in range(width)]
+    path = tmp_path / "walk.csv"
+    header = ",".join(["t", *names])
+    times = STEP * np.arange(len(speeds))
+    table = np.column_stack([times, *tables])
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+
+    decoded = jid.experiment.load_experiment(folder / "dog.toml")
+    report = jid.identify_logs(jid.Setup(base), [path], decoded.columns)
+    bodies = np.array(jid.robots.urdf_parameters(folder / "dog.urdf", floating=True))
+    total_mass = bodies[::10].sum()
+    masses = np.zeros(base.model.size)
+    masses[: len(bodies) : 10] = 1.0
+    row = masses[list(base.indices)]
+    assert np.isclose(row @ report.fit.parameters, total_mass, rtol=3e-3)
+    assert report.identification[0].relative < 0.05
+    texts = [x.text for x in report.judgement.findings]
+    (difference,) = [text for text in texts if "other legs" in text]
+    assert "`b2`" in difference
+    assert "1.0 and not 0.30" in difference
+
+
 def test_feet_need_a_floating_base(dog):
     folder, _ = dog
     path = folder / "fixed.toml"
