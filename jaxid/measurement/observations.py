@@ -17,7 +17,6 @@ from jaxid.arrays import (
     Numbers,
     Texts,
     Vector,
-    namespace,
 )
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -233,21 +232,21 @@ class Observations(eqx.Module):
         motion, _ = self.read(slice(first_sample, last_sample + 1, factor))
         return motion
 
-    def reduce(self, x: Float[AnyArray, "samples *columns"]) -> Any:
+    def reduce(self, x: Float[AnyArray, "samples *columns"]) -> np.ndarray:
         """Turn forces or columns at all samples into rows (Eq. 26).
 
         The steps are smoothing, trimming and decimation. They are linear, and the same
         for every column: what holds between columns and forces at the samples holds
-        between the rows. JAX can compile and differentiate them.
+        between the rows.
         """
         edge = self.filter.edge(self.sample_time)
         parts = []
         for a, b in self.segments:
             inner_samples = slice(edge, b - a - edge)
             parts.append(self._reduce(inner_samples, slice(None), x[a:b]))
-        return namespace(x).concatenate(parts)
+        return np.concatenate(parts)
 
-    def _reduce(self, samples: slice, rows: slice, x: AnyArray) -> Any:
+    def _reduce(self, samples: slice, rows: slice, x: AnyArray) -> np.ndarray:
         """Smooth, take the samples between the edges, decimate, and take some rows."""
         smooth_samples = self.filter.smooth(x, self.sample_time)
         return self.decimation(smooth_samples[samples])[rows]

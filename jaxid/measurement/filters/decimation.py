@@ -3,7 +3,6 @@
 import abc
 import math
 from collections.abc import Iterable
-from typing import Any
 
 import equinox as eqx
 import numpy as np
@@ -13,7 +12,7 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 
 from .filter import integer
-from .low_pass import AbstractLowPass, AllPass, float_array, recursive
+from .low_pass import AbstractLowPass, AllPass, recursive
 
 MAX_FACTOR = 13
 """Largest factor of a stage: the poles of its low-pass are still exact enough."""
@@ -46,9 +45,9 @@ class AbstractDecimation(eqx.Module):
         """Number of samples for each row."""
         return math.prod(self.stages)
 
-    def __call__(self, x: Float[AnyArray, "samples *columns"]) -> Any:
+    def __call__(self, x: Float[AnyArray, "samples *columns"]) -> np.ndarray:
         """Decimate along the first axis: the first row is that of the first sample."""
-        x = float_array(x)
+        x = np.asarray(x, np.float64)
         for i, factor in enumerate(self.stages):
             x = self.low_pass(i)(x)[::factor]
         return x

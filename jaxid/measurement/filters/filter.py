@@ -8,9 +8,10 @@ forces and columns.
 
 import abc
 from collections.abc import Callable
-from typing import Any, ClassVar
+from typing import ClassVar
 
 import equinox as eqx
+import numpy as np
 
 from jaxid.arrays import AnyArray, Float, JointSamples
 from jaxid.dynamics.motion import Motion
@@ -66,7 +67,9 @@ class AbstractFilter(eqx.Module):
         """
         return self.low_pass(sample_time).memory(MOTION_TAIL) + DIFFERENCE_SAMPLES
 
-    def smooth(self, x: Float[AnyArray, "samples *columns"], sample_time: float) -> Any:
+    def smooth(
+        self, x: Float[AnyArray, "samples *columns"], sample_time: float
+    ) -> np.ndarray:
         """Filter forces or columns of one segment.
 
         The filter is linear and has no phase; it leaves constants unchanged.

@@ -2,14 +2,12 @@
 
 import abc
 import math
-from typing import Any
 
 import equinox as eqx
-import jax
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Array, Float, Matrix, namespace
+from jaxid.arrays import AnyArray, Float, Matrix
 from jaxid.errors import InputError
 
 SETTLING_TOLERANCE = 1e-4
@@ -31,8 +29,8 @@ class AbstractLowPass(eqx.Module):
     cutoff: eqx.AbstractVar[float]
 
     @abc.abstractmethod
-    def __call__(self, x: Float[AnyArray, "samples *columns"]) -> Any:
-        """Filter along the first axis; JAX arrays stay such and are differentiable."""
+    def __call__(self, x: Float[AnyArray, "samples *columns"]) -> np.ndarray:
+        """Filter along the first axis, in double precision."""
 
     @abc.abstractmethod
     def gain(
@@ -54,7 +52,7 @@ class AllPass(AbstractLowPass):
     cutoff: float = eqx.field(static=True, default=math.inf)
 
     def __call__(self, x):  # noqa: D102
-        return float_array(x)
+        return np.asarray(x, np.float64)
 
     def gain(self, frequency, sample_time):  # noqa: D102
         return np.ones(np.shape(frequency))
@@ -75,16 +73,13 @@ class RecursiveLowPass(AbstractLowPass):
     cutoff: float = eqx.field(static=True)
 
     def __call__(self, x):  # noqa: D102
-        x = float_array(x)
+        x = np.asarray(x, np.float64)
         if x.size == 0:
             return x
         sos = np.array(self.sections)
         taps = 2 * len(sos) + 1
         padding = min(3 * taps, len(x) - 1)  # as scipy's
         columns = x.reshape(len(x), -1)
-        if isinstance(columns, jax.Array):
-            return _filter_both_ways(sos, columns, padding).reshape(x.shape)
-
         # By blocks of columns, which keep scipy's copies small.
         result = np.empty_like(columns)
         width = max(1, BLOCK_SIZE // len(columns))
@@ -134,41 +129,6 @@ def _impulse_memory(sos: Matrix, radius: float, tolerance: float) -> int:
     is_clear = tail > tolerance * tail[0]
     last_sample = np.flatnonzero(is_clear)[-1]
     return int(last_sample) + 1
-
-
-def _filter_both_ways(sos: Matrix, x: Array, padding: int) -> Array:
-    """Filter forward and backward with odd extensions, like scipy's `sosfiltfilt`."""
-    steady_states = scipy.signal.sosfilt_zi(sos)
-
-    def step(states, x):
-        next_states = []
-        for (b0, b1, b2, _, a1, a2), (z1, z2) in zip(sos, states, strict=True):
-            y = b0 * x + z1
-            next_z1 = b1 * x - a1 * y + z2
-            next_z2 = b2 * x - a2 * y
-            next_states.append((next_z1, next_z2))
-            x = y
-        return next_states, x
-
-    def one_way(x: Array) -> Array:
-        states = [(z1 * x[0], z2 * x[0]) for z1, z2 in steady_states]
-        _, y = jax.lax.scan(step, states, x, unroll=4)
-        return y
-
-    forward_outputs = one_way(odd_extension(x, padding))
-    outputs = one_way(forward_outputs[::-1])[::-1]
-    return outputs[padding : padding + len(x)]
-
-
-def odd_extension(x: Any, samples: int) -> Any:
-    """Extend both ends by samples that are mirrored at the end's time and value."""
-    padding = [(samples, samples)] + [(0, 0)] * (x.ndim - 1)
-    return namespace(x).pad(x, padding, mode="reflect", reflect_type="odd")
-
-
-def float_array(x: Any) -> Any:
-    """Return an array of JAX as it is, and another one in double precision."""
-    return x if isinstance(x, jax.Array) else np.asarray(x, np.float64)
 
 
 def butterworth(
