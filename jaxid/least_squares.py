@@ -1,4 +1,4 @@
-"""Least squares of a nonlinear function, within bounds; batched by `jax.vmap`."""
+"""Least squares of a nonlinear function, within bounds."""
 
 from collections.abc import Callable, Iterator
 from typing import Any, NamedTuple
@@ -34,48 +34,10 @@ class Minimum(NamedTuple):
     jacobian: Float[Array, "rows unknowns"]
 
 
-def minimise_squares(
-    residuals: Residuals,
-    start: Float[AnyArray, " unknowns"],
-    lower: AnyArray | float = -jnp.inf,
-    upper: AnyArray | float = jnp.inf,
-    *,
-    args: Any = None,
-    rtol: float = 1e-8,
-    max_steps: int = 100,
-) -> Minimum:
-    """Minimise the sum of squares of residuals within bounds.
-
-    Args:
-        residuals: Differentiable function of the unknowns and of `args`.
-        start: Unknowns at which the search starts; brought within the bounds.
-        lower: Smallest unknowns.
-        upper: Largest unknowns.
-        args: Other arguments of `residuals`.
-        rtol: Relative decrease of the sum of squares below which the search ends.
-        max_steps: Largest number of steps.
-    """
-    lower, upper = jnp.asarray(lower), jnp.asarray(upper)
-    solution = optx.least_squares(
-        residuals,
-        BoundedLevenbergMarquardt(rtol=rtol),
-        jnp.clip(jnp.asarray(start), lower, upper),
-        args=args,
-        options={"lower": lower, "upper": upper},
-        max_steps=max_steps,
-        throw=False,
-    )
-    has_converged = solution.result == optx.RESULTS.successful
-    end = solution.stats["end"]
-    return Minimum(solution.value, has_converged, end.residuals, end.jacobian)
-
-
 def search_squares(
     residuals: Residuals, start: AnyArray, bounds: Bounds, args: Any, rtol: float
 ) -> Iterator[Minimum]:
-    """Yield the best unknowns after each step of a search that takes long.
-
-    Unlike `minimise_squares` it can show progress and be interrupted.
+    """Yield the best unknowns after each step of a search, which may take long.
 
     Args:
         residuals: Differentiable function of the unknowns and of `args`.
@@ -181,8 +143,8 @@ class BoundedLevenbergMarquardt(optx.AbstractLeastSquaresSolver):
         return has_settled | is_stuck, optx.RESULTS.successful
 
     def postprocess(self, fn, y, aux, args, options, state, tags, result):
-        """Return the unknowns, and the linearisation there."""
-        return y, aux, {"end": state}
+        """Return the unknowns as they are."""
+        return y, aux, {}
 
 
 def _linearise(fn, y: Array, args: Any) -> tuple[Array, Array]:

@@ -1,12 +1,25 @@
 """Bounded least squares against scipy, alone and in batches."""
 
+import itertools
+
 import jax
 import jax.numpy as jnp
 import numpy as np
+import optimistix as optx
 import pytest
 from scipy import optimize
 
-from jaxid.least_squares import minimise_squares
+from jaxid.least_squares import BoundedLevenbergMarquardt, Minimum, search_squares
+
+FREE = (-np.inf, np.inf)
+
+
+def last_step(residuals, start, bounds=FREE, data=None, rtol=1e-8) -> Minimum:
+    """Return the end of a search, or its hundredth step."""
+    steps = [
+        *itertools.islice(search_squares(residuals, start, bounds, data, rtol), 100)
+    ]
+    return steps[-1]
 
 
 def rosenbrock(x, scale):
@@ -26,7 +39,7 @@ def measured():
 
 
 def test_a_curved_valley_is_followed_to_its_end():
-    minimum = minimise_squares(rosenbrock, np.array([-1.2, 1.0]), args=10.0)
+    minimum = last_step(rosenbrock, np.array([-1.2, 1.0]), data=10.0)
     assert minimum.converged
     np.testing.assert_allclose(minimum.x, [1.0, 1.0], atol=1e-8)
 
@@ -42,7 +55,7 @@ def test_a_curved_valley_is_followed_to_its_end():
 )
 def test_a_fit_within_bounds_is_that_of_scipy(measured, lower, upper):
     start = np.array([1.0, 2.0, 0.9])
-    minimum = minimise_squares(decay, start, lower, upper, args=measured, rtol=1e-14)
+    minimum = last_step(decay, start, (lower, upper), measured, rtol=1e-14)
     peer = optimize.least_squares(
         lambda x: np.asarray(decay(x, measured)),
         np.clip(start, lower, upper),
@@ -63,25 +76,35 @@ def test_a_batch_holds_the_results_of_its_members(measured):
     start = jnp.array([1.0, 1.0, 0.0])
 
     def fit(values):
-        return minimise_squares(decay, start, 0.0, args=(jnp.asarray(time), values))
+        solution = optx.least_squares(
+            decay,
+            BoundedLevenbergMarquardt(),
+            start,
+            args=(jnp.asarray(time), values),
+            options={"lower": jnp.zeros(3), "upper": jnp.full(3, np.inf)},
+            throw=False,
+        )
+        return solution.value, solution.result == optx.RESULTS.successful
 
-    batch = jax.vmap(fit)(jnp.asarray(many_values))
-    assert batch.converged.all()
+    batch, converged = jax.vmap(fit)(jnp.asarray(many_values))
+    assert converged.all()
+    bounds = (np.zeros(3), np.full(3, np.inf))
     for k, values in enumerate(many_values):
-        alone = fit(jnp.asarray(values))
-        np.testing.assert_allclose(batch.x[k], alone.x, rtol=1e-7)
+        alone = last_step(decay, start, bounds, (time, values))
+        np.testing.assert_allclose(batch[k], alone.x, rtol=1e-7)
 
 
 def test_unknowns_without_effect_stay():
     def residuals(x, _):
         return x[:1] - 3.0
 
-    minimum = minimise_squares(residuals, np.array([0.0, 7.0]))
+    minimum = last_step(residuals, np.array([0.0, 7.0]))
     np.testing.assert_allclose(minimum.x, [3.0, 7.0], atol=1e-6)
 
 
 def test_a_search_without_end_says_so():
-    minimum = minimise_squares(
-        rosenbrock, np.array([-1.2, 1.0]), args=10.0, max_steps=2
-    )
-    assert not minimum.converged
+    search = search_squares(rosenbrock, np.array([-1.2, 1.0]), FREE, 10.0, 1e-8)
+    first_step = next(search)
+    second_step = next(search)
+    assert not first_step.converged
+    assert not second_step.converged
