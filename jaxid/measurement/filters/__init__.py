@@ -6,12 +6,7 @@ from .decimation import (
     Subsample as Subsample,
 )
 from .filter import AbstractFilter as AbstractFilter
-from .low_pass import (
-    AbstractLowPass as AbstractLowPass,
-    AllPass as AllPass,
-    RecursiveLowPass as RecursiveLowPass,
-    recursive as recursive,
-)
+from .low_pass import LowPass as LowPass
 from .motion_filters import (
     PaperFilter as PaperFilter,
     PeriodicFourier as PeriodicFourier,

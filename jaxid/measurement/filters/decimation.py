@@ -12,7 +12,7 @@ from jaxid.arrays import AnyArray, Float
 from jaxid.errors import InputError
 
 from .filter import integer
-from .low_pass import AbstractLowPass, AllPass, recursive
+from .low_pass import LowPass
 
 MAX_FACTOR = 13
 """Largest factor of a stage: the poles of its low-pass are still exact enough."""
@@ -31,7 +31,7 @@ class AbstractDecimation(eqx.Module):
         """Factors, one after the other."""
 
     @abc.abstractmethod
-    def low_pass(self, stage: int) -> AbstractLowPass:
+    def low_pass(self, stage: int) -> LowPass:
         """Return the filter before a stage, at that stage's own rate."""
 
     def check(self, cutoff: float, sample_time: float) -> None:
@@ -82,7 +82,7 @@ class Subsample(AbstractDecimation):
         return (self.step,)
 
     def low_pass(self, stage):  # noqa: D102
-        return AllPass()
+        return LowPass()
 
     def check(self, cutoff, sample_time):  # noqa: D102
         rate = 1.0 / (sample_time * self.step)
@@ -128,6 +128,6 @@ class Decimation(AbstractDecimation):
     def low_pass(self, stage):  # noqa: D102
         factor = self.factors[stage]
         if factor == 1:
-            return AllPass()
+            return LowPass()
         sos = scipy.signal.cheby1(8, 0.05, 0.8 / factor, output="sos")
-        return recursive(np.asarray(sos, np.float64), 0.4 / factor)
+        return LowPass.of(np.asarray(sos, np.float64), 0.4 / factor)

@@ -17,7 +17,7 @@ from jaxid.arrays import AnyArray, Float, JointSamples
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 
-from .low_pass import SETTLING_TOLERANCE, AbstractLowPass
+from .low_pass import SETTLING_TOLERANCE, LowPass
 
 DIFFERENCE_SAMPLES = 2
 """Samples on each side that differences of fourth order need."""
@@ -48,7 +48,7 @@ class AbstractFilter(eqx.Module):
         """
 
     @abc.abstractmethod
-    def low_pass(self, sample_time: float) -> AbstractLowPass:
+    def low_pass(self, sample_time: float) -> LowPass:
         """Return the zero-phase filter of forces and columns."""
 
     def edge(self, sample_time: float) -> int:

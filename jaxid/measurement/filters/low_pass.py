@@ -1,6 +1,5 @@
 """Zero-phase low-passes: recursive filters that run forward and backward."""
 
-import abc
 import math
 
 import equinox as eqx
@@ -18,63 +17,34 @@ BLOCK_SIZE = 2**22
 """Numbers that are filtered at once."""
 
 
-class AbstractLowPass(eqx.Module):
-    """Linear filter without phase, and with gain one for constants.
-
-    Attributes:
-        cutoff: Frequency at which the gain falls below 1/2 [Hz]; infinite if everything
-            passes.
-    """
-
-    cutoff: eqx.AbstractVar[float]
-
-    @abc.abstractmethod
-    def __call__(self, x: Float[AnyArray, "samples *columns"]) -> np.ndarray:
-        """Filter along the first axis, in double precision."""
-
-    @abc.abstractmethod
-    def gain(
-        self, frequency: Float[AnyArray, " lines"], sample_time: float
-    ) -> np.ndarray:
-        """Return the size of the gain for sinusoids of some frequencies [Hz]."""
-
-    @abc.abstractmethod
-    def memory(self, tolerance: float = 1e-14) -> int:
-        """Return the number of samples until the impulse response has decayed.
-
-        From there on it stays below a fraction of its peak.
-        """
-
-
-class AllPass(AbstractLowPass):
-    """Low-pass that changes nothing."""
-
-    cutoff: float = eqx.field(static=True, default=math.inf)
-
-    def __call__(self, x):  # noqa: D102
-        return np.asarray(x, np.float64)
-
-    def gain(self, frequency, sample_time):  # noqa: D102
-        return np.ones(np.shape(frequency))
-
-    def memory(self, tolerance=1e-14):  # noqa: D102
-        return 0
-
-
-class RecursiveLowPass(AbstractLowPass):
+class LowPass(eqx.Module):
     """Recursive filter that runs forward and backward, as scipy's `sosfiltfilt`.
 
+    It has no phase, and gain one for constants.
+
     Attributes:
-        sections: Second-order sections of one direction, as in scipy.
-        cutoff: Frequency at which the gain of both directions falls below 1/2 [Hz].
+        sections: Second-order sections of one direction, as in scipy; without any,
+            everything passes.
+        cutoff: Frequency at which the gain of both directions falls below 1/2 [Hz];
+            infinite if everything passes.
     """
 
-    sections: tuple[tuple[float, ...], ...] = eqx.field(static=True)
-    cutoff: float = eqx.field(static=True)
+    sections: tuple[tuple[float, ...], ...] = eqx.field(static=True, default=())
+    cutoff: float = eqx.field(static=True, default=math.inf)
 
-    def __call__(self, x):  # noqa: D102
+    @classmethod
+    def of(cls, sos: Matrix, cutoff: float) -> "LowPass":
+        """Return second-order sections as a filter whose gain for constants is one."""
+        numerators = sos[:, :3].sum(axis=1)
+        denominators = sos[:, 3:].sum(axis=1)
+        sos = sos.copy()
+        sos[0, :3] /= np.prod(numerators / denominators)
+        return cls(tuple(tuple(row) for row in sos.tolist()), cutoff)
+
+    def __call__(self, x: Float[AnyArray, "samples *columns"]) -> np.ndarray:
+        """Filter along the first axis, in double precision."""
         x = np.asarray(x, np.float64)
-        if x.size == 0:
+        if x.size == 0 or not self.sections:
             return x
         sos = np.array(self.sections)
         taps = 2 * len(sos) + 1
@@ -92,12 +62,23 @@ class RecursiveLowPass(AbstractLowPass):
             result[:, block] = smooth_rows.T
         return result.reshape(x.shape)
 
-    def gain(self, frequency, sample_time):  # noqa: D102
+    def gain(
+        self, frequency: Float[AnyArray, " lines"], sample_time: float
+    ) -> np.ndarray:
+        """Return the size of the gain for sinusoids of some frequencies [Hz]."""
+        if not self.sections:
+            return np.ones(np.shape(frequency))
         angular_frequency = 2 * math.pi * np.asarray(frequency) * sample_time
         _, response = scipy.signal.sosfreqz(np.array(self.sections), angular_frequency)
         return np.abs(response) ** 2
 
-    def memory(self, tolerance=1e-14):  # noqa: D102
+    def memory(self, tolerance: float = 1e-14) -> int:
+        """Return the number of samples until the impulse response has decayed.
+
+        From there on it stays below a fraction of its peak.
+        """
+        if not self.sections:
+            return 0
         sos = np.array(self.sections)
         poles = np.concatenate([np.roots(denominator) for denominator in sos[:, 3:]])
         radius = np.abs(poles).max(initial=0.0)
@@ -133,26 +114,16 @@ def _impulse_memory(sos: Matrix, radius: float, tolerance: float) -> int:
 
 def butterworth(
     cutoff: float, order: int, sample_time: float, name: str = "cutoff"
-) -> AbstractLowPass:
+) -> LowPass:
     """Return a Butterworth filter for forward and backward runs.
 
     `cutoff` [Hz] is scipy's.
     """
     if math.isinf(cutoff):
-        return AllPass()
+        return LowPass()
     require_cutoff(name, cutoff, sample_time)
     sos = scipy.signal.butter(order, cutoff, output="sos", fs=1.0 / sample_time)
-    return recursive(np.asarray(sos, np.float64), cutoff)
-
-
-def recursive(sos: Matrix, cutoff: float) -> RecursiveLowPass:
-    """Return second-order sections as a filter whose gain for constants is one."""
-    numerators = sos[:, :3].sum(axis=1)
-    denominators = sos[:, 3:].sum(axis=1)
-    sos = sos.copy()
-    sos[0, :3] /= np.prod(numerators / denominators)
-    sections = tuple(tuple(row) for row in sos.tolist())
-    return RecursiveLowPass(sections=sections, cutoff=cutoff)
+    return LowPass.of(np.asarray(sos, np.float64), cutoff)
 
 
 def require_cutoff(name: str, cutoff: float, sample_time: float) -> None:

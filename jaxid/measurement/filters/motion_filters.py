@@ -22,9 +22,8 @@ from .filter import (
 )
 from .low_pass import (
     SETTLING_TOLERANCE,
-    AbstractLowPass,
+    LowPass,
     butterworth,
-    recursive,
     require_cutoff,
 )
 
@@ -239,10 +238,10 @@ def _bilinear(
     return np.asarray(b), np.asarray(a)
 
 
-def _first_order(name: str, omega: float, sample_time: float) -> AbstractLowPass:
+def _first_order(name: str, omega: float, sample_time: float) -> LowPass:
     r"""Return $1 / (s / \omega + 1)$, forward and backward."""
     sos = scipy.signal.tf2sos(*_bilinear(name, [1.0], omega, sample_time))
-    return recursive(np.asarray(sos), omega / (2 * math.pi))
+    return LowPass.of(np.asarray(sos), omega / (2 * math.pi))
 
 
 def first_difference(x: Matrix, sample_time: float) -> Matrix:
