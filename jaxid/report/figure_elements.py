@@ -110,7 +110,6 @@ class Scene:
     # body from whose origin the line to each point leads; -1 for the ground
     links: tuple[int, ...]
     frames: np.ndarray  # samples at which the page shows the robot
-    poses: int = 6  # number of poses on paper
     # (samples, joints): values of the joints, as colours; None for none
     values: np.ndarray | None = None
     label: str = ""  # name of the values, with their unit

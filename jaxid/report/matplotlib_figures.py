@@ -37,6 +37,8 @@ PANEL_TITLE_LENGTH = 26
 """Largest number of letters in a line of a panel's title, beside its value."""
 TICK_LENGTH = 20
 """Largest number of letters in a line of a name on an axis."""
+POSES_ON_PAPER = 6
+"""Poses of a robot, evenly spaced from the first to the last of a motion."""
 DATED_ENTRIES = {"png": "Software", "pdf": "CreationDate", "svg": "Date"}
 """Entry of a file that differs from day to day, or with the version of matplotlib."""
 
@@ -196,7 +198,7 @@ def _draw_path(figure: Figure, axes: Any, scene: Scene) -> None:
 def _draw_poses(axes: Any, scene: Scene) -> None:
     """Draw the robot in some poses, earlier ones paler."""
     samples = len(scene.points)
-    count = min(scene.poses, samples)
+    count = min(POSES_ON_PAPER, samples)
     poses = np.linspace(0, samples - 1, count).round().astype(int)
     for number, pose in enumerate(poses, 1):
         opacity = 0.16 + 0.84 * (number / count) ** 2

@@ -98,7 +98,6 @@ def pose_figure(
     time: Times | None = None,
     values: JointSamples | None = None,
     label: str = "",
-    poses: int = 6,
     title: str | None = None,
     shapes: CollisionModel | None = None,
     clouds: Sequence[Cloud] = (),
@@ -112,7 +111,6 @@ def pose_figure(
         values: Values of the joints that colour their links, and on average the path of
             the end-effector, such as torque errors.
         label: Name of these values, with their unit.
-        poses: Number of poses on paper, evenly spaced from the first to the last.
         title: Title of the figure; the robot's name if None.
         shapes: Shapes of robot and surroundings that the page shows.
         clouds: Points of bodies whose convex hulls the page shows.
@@ -146,7 +144,6 @@ def pose_figure(
         points=points,
         links=(*robot.parent, robot.tip_body),
         frames=frames,
-        poses=poses,
         values=values,
         label=label,
         solids=solids,
