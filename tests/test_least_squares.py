@@ -16,10 +16,9 @@ FREE = (-np.inf, np.inf)
 
 def last_step(residuals, start, bounds=FREE, data=None, rtol=1e-8) -> Minimum:
     """Return the end of a search, or its hundredth step."""
-    steps = [
-        *itertools.islice(search_squares(residuals, start, bounds, data, rtol), 100)
-    ]
-    return steps[-1]
+    search = search_squares(residuals, start, bounds, data, rtol)
+    *_, last = itertools.islice(search, 100)
+    return last
 
 
 def rosenbrock(x, scale):
@@ -55,7 +54,8 @@ def test_a_curved_valley_is_followed_to_its_end():
 )
 def test_a_fit_within_bounds_is_that_of_scipy(measured, lower, upper):
     start = np.array([1.0, 2.0, 0.9])
-    minimum = last_step(decay, start, (lower, upper), measured, rtol=1e-14)
+    bounds = (np.array(lower), np.array(upper))
+    minimum = last_step(decay, start, bounds, measured, rtol=1e-14)
     peer = optimize.least_squares(
         lambda x: np.asarray(decay(x, measured)),
         np.clip(start, lower, upper),
