@@ -31,7 +31,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.observations import Observations
 
-SAMPLES_PER_CHUNK = 8192
+SAMPLES_PER_CHUNK = 4096
 """Samples whose columns a core evaluates at once."""
 MAX_GROWTH = 1e4
 """Squared size of rows, in units of a triangle, up to which products lose no digits."""
@@ -52,10 +52,26 @@ class RowChunk(NamedTuple):
     block: int  # index of the block of time, counted over all recordings
     rows: slice  # range of the recording's rows
     indices: Columns  # base parameters that can act on each joint
-    columns: Matrices  # columns of each joint [rows, indices of the joint]
-    # measured forces less those of a known tool [rows, joints], in [N m] or [N]
-    forces: Matrix
+    # Columns of each joint, followed by its measured force less that of a known tool
+    # [N m or N], stand one after the other in memory.
+    values: Matrix
     mask: np.ndarray  # rows that count for each joint [rows, joints]
+
+    @property
+    def systems(self) -> Matrices:
+        """Columns and force of each joint [rows, indices of the joint and force]."""
+        ends = np.cumsum([len(indices) + 1 for indices in self.indices])
+        return np.split(self.values, ends[:-1], axis=1)
+
+    @property
+    def columns(self) -> Matrices:
+        """Columns of each joint [rows, indices of the joint]."""
+        return [system[:, :-1] for system in self.systems]
+
+    @property
+    def forces(self) -> Matrix:
+        """Measured forces less those of a known tool [rows, joints], in [N m or N]."""
+        return np.stack([system[:, -1] for system in self.systems], axis=1)
 
     def part(self, rows: slice) -> "RowChunk":
         """Return the rows of a range of the recording, which lies within the chunk."""
@@ -63,8 +79,7 @@ class RowChunk(NamedTuple):
         selection = slice(rows.start - offset, rows.stop - offset)
         return self._replace(
             rows=rows,
-            columns=[x[selection] for x in self.columns],
-            forces=self.forces[selection],
+            values=self.values[selection],
             mask=self.mask[selection],
         )
 
@@ -83,22 +98,15 @@ class RowChunk(NamedTuple):
 
     def equations(self) -> Iterator[Matrix]:
         """Yield the rows `[columns, force]` of each joint that count."""
-        joints = zip(self.columns, self.forces.T, self.mask.T, strict=True)
-        for theta, force, mask in joints:
-            # Columns stand one after the other in memory.
-            columns = np.vstack([theta.T, force])
-            yield columns.T if mask.all() else columns[:, mask].T
+        for system, mask in zip(self.systems, self.mask.T, strict=True):
+            yield system if mask.all() else system.T[:, mask].T
 
 
 def join_chunks(chunks: Sequence[RowChunk]) -> RowChunk:
     """Return the rows of chunks that follow each other in one recording."""
-    columns = [
-        np.concatenate(x) for x in zip(*(c.columns for c in chunks), strict=True)
-    ]
     return chunks[0]._replace(
         rows=slice(chunks[0].rows.start, chunks[-1].rows.stop),
-        columns=columns,
-        forces=np.concatenate([chunk.forces for chunk in chunks]),
+        values=np.concatenate([chunk.values for chunk in chunks]),
         mask=np.concatenate([chunk.mask for chunk in chunks]),
     )
 
@@ -118,6 +126,7 @@ def row_chunks(
     memory = low_pass.memory() + observations.decimation.memory()
     # Parts that are shorter than what filters add to them would take far longer.
     samples = max(samples, 4 * memory)
+    regressor = base.joint_regressor
 
     def parts() -> Iterator[tuple]:
         for chunk in observations.chunks(samples, ranges):
@@ -126,13 +135,17 @@ def row_chunks(
     def rows_of(part: tuple) -> RowChunk:
         chunk, motion, forces = part
         rows = slice(*chunk.rows)
+        arguments = base.model.arguments(motion)
+        columns = regressor.evaluate(*(np.asarray(x, float).T for x in arguments))
+        joint_forces = without_tool(base, motion, forces).T
+        pairs = zip(columns, joint_forces, strict=True)
+        values = np.vstack([array for pair in pairs for array in pair])
         return RowChunk(
             recording=0,
             block=0,
             rows=rows,
-            indices=base.acting_columns,
-            columns=[chunk.reduce(theta) for theta in base.regressor_rows(motion)],
-            forces=chunk.reduce(without_tool(base, motion, forces)),
+            indices=regressor.columns,
+            values=chunk.reduce(values.T),
             mask=mask[rows],
         )
 
@@ -166,13 +179,8 @@ class JointFactor(eqx.Module):
     R: Float[AnyArray, "height width"]
     rows: int = eqx.field(static=True)  # number of rows that were reduced to R
 
-    def append(self, rows: Matrix) -> "JointFactor":
-        """Return the factor after more rows `[columns, force]`."""
-        R = _triangle_with_rows(np.asarray(self.R), rows)
-        return JointFactor(self.columns, R, self.rows + len(rows))
 
-
-def _triangle_with_rows(R: np.ndarray, rows: np.ndarray) -> np.ndarray:
+def triangle_with_rows(R: Matrix, rows: Matrix) -> Matrix:
     """Return the R factor of a triangle above more rows.
 
     Products of many rows take a third of the time of their decomposition. In units of
@@ -194,16 +202,11 @@ class Factors(eqx.Module):
     joints: tuple[JointFactor, ...]  # factor of each joint
     size: int = eqx.field(static=True)  # number of base parameters
 
-    def append(self, rows: Iterable[Matrix]) -> "Factors":
-        """Return the factors after more rows `[columns, force]` of each joint."""
-        pairs = zip(self.joints, rows, strict=True)
-        return Factors(tuple(joint.append(x) for joint, x in pairs), self.size)
-
     def __add__(self, other: "Factors") -> "Factors":
         """Return the factors of both sets of rows together."""
         joints = []
         for joint, other_joint in zip(self.joints, other.joints, strict=True):
-            R = joint.append(np.asarray(other_joint.R)).R
+            R = triangle_with_rows(np.asarray(joint.R), np.asarray(other_joint.R))
             joints.append(JointFactor(joint.columns, R, joint.rows + other_joint.rows))
         return Factors(tuple(joints), self.size)
 
@@ -238,13 +241,32 @@ class Factors(eqx.Module):
         return np.array([np.sum(joint.R[:, -1] ** 2) for joint in self.joints])
 
 
-def empty_factors(columns: Columns, size: int) -> Factors:
-    """Return factors of no rows, from each joint's columns and the number of all."""
-    joints = []
-    for indices in columns:
-        no_rows = np.zeros((0, len(indices) + 1))
-        joints.append(JointFactor(tuple(indices), no_rows, 0))
-    return Factors(tuple(joints), size)
+class GrowingFactors:
+    """Factors of rows that come one after another.
+
+    Args:
+        columns: Base parameters that can act on each joint.
+        size: Number of base parameters.
+    """
+
+    def __init__(self, columns: Columns, size: int):
+        self._columns = columns
+        self._size = size
+        self._triangles = [np.zeros((0, len(indices) + 1)) for indices in columns]
+        self._counts = [0 for _ in columns]
+
+    def append(self, rows: Iterable[Matrix]) -> None:
+        """Add more rows `[columns, force]` of each joint."""
+        for joint, joint_rows in enumerate(rows):
+            R = triangle_with_rows(self._triangles[joint], joint_rows)
+            self._triangles[joint] = R
+            self._counts[joint] += len(joint_rows)
+
+    def result(self) -> Factors:
+        """Return the factors of all rows so far."""
+        columns = map(tuple, self._columns)
+        joints = map(JointFactor, columns, self._triangles, self._counts)
+        return Factors(tuple(joints), self._size)
 
 
 class Blocks(eqx.Module):

@@ -17,9 +17,9 @@ from .factors import (
     SAMPLES_PER_CHUNK,
     Blocks,
     Factors,
+    GrowingFactors,
     Ranges,
     RowChunk,
-    empty_factors,
     row_chunks,
 )
 
@@ -120,13 +120,13 @@ class RegressionProblem:
 
     def _reduce(self, number: int, equations: Callable):
         """Return the factors of one recording's blocks of time."""
-        empty_part = empty_factors(self.base.acting_columns, self.base.size)
-        parts = [empty_part] * (len(self._edges[number]) - 1)
+        columns = self.base.acting_columns
+        blocks = self._edges[number][1:]
+        parts = [GrowingFactors(columns, self.base.size) for _ in blocks]
         first_block = self._first_block(number)
         for chunk in self.recording_chunks(number):
-            block = chunk.block - first_block
-            parts[block] = parts[block].append(equations(chunk))
-        return parts
+            parts[chunk.block - first_block].append(equations(chunk))
+        return [part.result() for part in parts]
 
     def _first_block(self, number: int) -> int:
         return sum(len(edges) - 1 for edges in self._edges[:number])
