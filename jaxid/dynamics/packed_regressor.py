@@ -65,11 +65,17 @@ class JointRegressor(eqx.Module):
 
     def __call__(self, *arrays: AnyArray, fence: bool = False) -> list[Array]:
         """Return the columns of each joint, from arguments with samples last."""
-        # Constants come as floats; an array of the batch's shape is made of each.
-        values = lower(self.program, fence)(*arrays)
-        dtype = jnp.result_type(*arrays, float)
         shape = jnp.shape(arrays[0])[1:]
         *batch, samples = shape
+        dtype = jnp.result_type(*arrays, float)
+        if self.program.loops is None:
+            distinct_values = lower(self.program, fence).distinct(*arrays)
+        else:
+            # XLA would take minutes to compile a long program in one piece.
+            rows = [jnp.reshape(x, (len(x), -1)).T for x in arrays]
+            distinct_values = distinct_rows(self.program, *rows).reshape(-1, *shape)
+        # Constants come as floats; an array of the batch's shape is made of each.
+        values = self.program.pack(distinct_values)
 
         joints = []
         for entries in self.entries:
@@ -107,10 +113,10 @@ class JointRegressor(eqx.Module):
             ends = np.cumsum([len(entries) for entries in self.entries])
             return jnp.split(packed_values, ends[:-1])
         batch = np.shape(arrays[0])[1:]
-        distinct_rows = evaluate_rows(self.program, *arrays)
+        rows = evaluate_rows(self.program, *arrays)
         joints = []
         for entries in self.entries:
-            values = packed_entries(self.program, distinct_rows, entries)
+            values = packed_entries(self.program, rows, entries)
             joints.append(values.reshape(len(entries), *batch))
         return joints
 

@@ -1,5 +1,6 @@
 """Batches give what one identification after the other gives."""
 
+import collections
 import math
 import re
 
@@ -18,6 +19,7 @@ from jaxid.identification.factors import Blocks
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.many_data_sets import identify_batch
 from jaxid.identification.uncertainty.blocks import bootstrap
+from jaxid.program import sample_methods
 
 SAMPLES = 150
 WEIGHTS = np.array([0.3, 2.0])
@@ -79,6 +81,17 @@ def test_every_data_set_as_if_identified_alone(base, sets, arrays):
         assert scaled <= fit.condition_numbers[k] <= 1.001 * base.size * scaled
     x = np.arange(37.0)
     np.testing.assert_array_equal(in_parts(lambda part: 2.0 * part, x), 2.0 * x)
+
+
+def test_columns_of_a_long_program_run_in_loops(base, sets, arrays, monkeypatch):
+    """XLA would take minutes to compile those of a humanoid robot in one piece."""
+    in_loops = sample_methods.FormLimits(piece=10, repetition=1)
+    monkeypatch.setattr(sample_methods, "LIMITS", in_loops)
+    monkeypatch.setattr(sample_methods, "_methods", collections.OrderedDict())
+    assert base.joint_regressor.program.loops is not None
+    fit = identify_batch(base, *arrays)
+    for k in range(3):
+        assert_same(fit, k, jid.identify(base, sets[k]))
 
 
 def test_a_gpu_takes_all_data_sets_from_where_they_are(monkeypatch):
