@@ -73,7 +73,8 @@ class JointRegressor(eqx.Module):
         else:
             # XLA would take minutes to compile a long program in one piece.
             rows = [jnp.reshape(x, (len(x), -1)).T for x in arrays]
-            distinct_values = distinct_rows(self.program, *rows).reshape(-1, *shape)
+            matrix = distinct_rows(self.program, *rows)
+            distinct_values = tuple(matrix.reshape(-1, *shape))
         # Constants come as floats; an array of the batch's shape is made of each.
         values = self.program.pack(distinct_values)
 
