@@ -1,13 +1,14 @@
 """Sessions in files become a report, and the robot's file with other origins."""
 
 import json
+import re
 import shutil
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-pytest.importorskip("pinocchio", reason="Pinocchio is not installed")
+pinocchio = pytest.importorskip("pinocchio", reason="Pinocchio is not installed")
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
 
 from true_arm import TrueArm, random_poses, true_origins
@@ -192,6 +193,33 @@ def test_wrong_experiments_are_refused(folder, line, name):
     message = result.output or str(result.exception)
     assert f"`{name}`" in message
     assert not output.exists()
+
+
+def test_better_geometry_explains_torques_better(folder):
+    """Torques of the true arm, by Pinocchio, need its geometry."""
+    nominal = jid.load_urdf(folder / "arm.urdf")
+    origins = true_origins(nominal, shift=5e-3, turn=2e-2)
+    arm = TrueArm(nominal, origins, masses=np.array(MASSES))
+    time = 0.02 * np.arange(400)
+    phases = np.outer(time, [1.1, 1.7, 2.3, 2.9])
+    rates = np.array([1.1, 1.7, 2.3, 2.9])
+    motion = (np.sin(phases), rates * np.cos(phases), -(rates**2) * np.sin(phases))
+    torques = [
+        pinocchio.rnea(arm.model, arm.data, *sample)
+        for sample in zip(*motion, strict=True)
+    ]
+    log = folder / "torques.csv"
+    header = "time,q1,q2,q3,q4,tau1,tau2,tau3,tau4"
+    table = np.column_stack([time, motion[0], torques])
+    np.savetxt(log, table, delimiter=",", header=header, comments="")
+    setup = jid.Setup(nominal)
+    columns = jid.Columns(angles="q{}", forces="tau{}", time="time")
+    logs = jid.workflow.TorqueLogs([log], columns)
+    better = jid.calibration.corrected_robot(nominal, origins)
+    remark = jid.workflow.geometry_calibration.compare_torques(setup, better, logs)
+    before, after = map(float, re.findall(r"([\d.]+) % with", remark.text))
+    assert after < 0.5 * before
+    assert "better geometry helps" in remark.text
 
 
 def test_two_reports_can_be_compared(report, tmp_path):
