@@ -360,7 +360,7 @@ def humanoid(seconds: float) -> list[Row]:
     width = 2.0 * float(np.sqrt(total @ fit.uncertainty.covariance @ total))
     error = abs(mass / truth - 1.0)
     worst = max(errors.relative for errors in report.verification)
-    recipe = f"floating.py --robot g1, one log of {seconds:g} s"
+    recipe = f"floating.py --robot G1, one log of {seconds:g} s"
     return [
         Row(
             "43",
@@ -376,7 +376,7 @@ def humanoid(seconds: float) -> list[Row]:
             recipe,
             "right",
             f"{report.verdict.status.name}; {100 * worst:.1f} %",
-            True,
+            worst < 0.1,
         ),
     ]
 

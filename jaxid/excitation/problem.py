@@ -94,6 +94,12 @@ class ExcitationProblem:
     ):
         require_float64("designing a motion")
         robot = base.model.robot
+        if robot.floating:
+            raise InputError(
+                f"`{robot.name}` has a floating base, whose motion follows from its "
+                "contacts: no motion is designed; move the trunk on all feet, then "
+                "lift one foot after another."
+            )
         self.base = base
         self.basis = FourierBasis(5, 0.8) if basis is None else basis
         self.limits = JointLimits(robot, self.basis, limits)

@@ -15,6 +15,7 @@ from virtual import (
 
 import jaxid as jid
 from jaxid.identification.uncertainty import UNCERTAINTIES, spectra_of_rows
+from jaxid.identification.uncertainty.blocks import block_covariance
 from jaxid.identification.uncertainty.slow_rows import HeldFriction
 from jaxid.identification.uncertainty.spectral import (
     SpectralTable,
@@ -239,6 +240,22 @@ def test_friction_that_lacks_near_rest_is_part_of_the_intervals():
     assert np.mean(alone) < 0.7
     assert np.mean(held) > 0.9
     assert np.mean(widening) < 1.05
+
+
+def test_a_direction_of_one_block_alone_does_not_spoil_the_jackknife():
+    """Only the first block tells the first unknown from the third."""
+    random = np.random.default_rng(6)
+    rows = random.normal(size=(10, 50, 3))
+    rows[1:, :, 2] = rows[1:, :, 0] + 1e-6 * rows[1:, :, 2]
+    every_row = rows.reshape(-1, 3)
+    forces = random.normal(size=500)
+    inverse = np.linalg.inv(every_row.T @ every_row)
+    residuals = (forces - every_row @ inverse @ every_row.T @ forces).reshape(10, 50)
+    blocks = list(zip(rows, residuals, strict=True))
+    covariance, _ = block_covariance(blocks, inverse)
+    ratios = np.sqrt(np.diag(covariance) / np.diag(inverse))
+    assert 0.5 < ratios[1] < 2.0
+    assert (ratios < 4.0).all()
 
 
 def test_held_friction_changes_estimates_as_columns_of_a_larger_fit():

@@ -193,6 +193,11 @@ def test_logs_of_legs_are_identified_and_equal_legs_compared(dog, base, tmp_path
     assert "1.0 and not 0.30" in difference
 
 
+def test_no_motion_is_designed_for_a_floating_base(base):
+    with pytest.raises(jid.InputError, match="contacts"):
+        jid.ExcitationProblem(base)
+
+
 def test_feet_need_a_floating_base(dog):
     folder, _ = dog
     path = folder / "fixed.toml"

@@ -30,6 +30,11 @@ from .result import AbstractUncertainty, Uncertainty, rescale_covariance
 
 ResidualBlock = tuple[Matrix, Vector]
 """Derivatives of a block's weighted forces by the unknowns, and the residuals."""
+MIN_REMAINDER = 1e-3
+"""Part of a direction that the other blocks must determine, to move without a block.
+
+A leg that is lifted in one block only tells its friction and rotors there.
+"""
 
 
 class BlockJackknife(AbstractUncertainty):
@@ -84,7 +89,8 @@ def block_covariance(
     Without block $k$ the estimate moves by $(1 - B G_k)^{-1} B g_k$, where $G_k$ is the
     block's information and $g_k$ the product of its derivatives and residuals. The
     covariance has at most the rank of the number of blocks less one: it serves single
-    unknowns, and tests of a few.
+    unknowns, and tests of a few. Directions that one block determines alone do not
+    move: without it nothing is known of them, and rounding would move all unknowns.
     """
     B = np.asarray(inverse)
     # The least squares below compare unknowns, which must not depend on their units.
@@ -99,7 +105,7 @@ def block_covariance(
         gradient = rows.T @ residuals
         remaining_part = np.eye(len(B)) - scaled_inverse @ information
         right_side = scaled_inverse @ gradient
-        step, *_ = np.linalg.lstsq(remaining_part, right_side, rcond=None)
+        step, *_ = np.linalg.lstsq(remaining_part, right_side, rcond=MIN_REMAINDER)
         steps.append(scale * step)
     dof = len(steps) - 1.0
     deviations = np.array(steps) - np.mean(steps, axis=0)
