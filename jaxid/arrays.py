@@ -164,17 +164,23 @@ def namespace(*arrays: AnyArray) -> ModuleType:
     return jnp if any(isinstance(x, jax.Array) for x in arrays) else np
 
 
-def on_cores(function: Callable[[Any], Any], items: Iterable) -> Iterator[Any]:
+def on_cores(
+    function: Callable[[Any], Any],
+    items: Iterable,
+    cores: int | None = None,
+    ahead: int | None = None,
+) -> Iterator[Any]:
     """Yield a function's results for some items in their order, computed on all cores.
 
-    The calling thread makes the items, and at most one for each core before it takes a
-    result.
+    The calling thread makes the items, and at most `ahead` of them before it takes a
+    result: by default one for each core.
     """
-    cores = os.cpu_count() or 1
+    cores = cores or os.cpu_count() or 1
+    ahead = ahead or cores
     pending_results: deque[Future] = deque()
     with ThreadPoolExecutor(cores) as pool:
         for item in items:
-            if len(pending_results) >= cores:
+            if len(pending_results) >= ahead:
                 yield pending_results.popleft().result()
             pending_results.append(pool.submit(function, item))
         while pending_results:

@@ -449,8 +449,10 @@ SLOW = EXPERIMENT.replace("step = 4", "step = 4\nmin_speed = 0.05")
 SLOW = SLOW.replace('time = "t"', 'time = "t"\nstart = 0.5\nstop = 5.5')
 
 
-@pytest.mark.parametrize("kind", ["csv", "parquet"])
-def test_long_logs_give_what_short_ones_give(folder, words, monkeypatch, kind):
+@pytest.mark.parametrize(("kind", "compiled_rows"), [("csv", True), ("parquet", False)])
+def test_long_logs_give_what_short_ones_give(
+    folder, words, monkeypatch, kind, compiled_rows
+):
     if kind == "parquet":
         for name in "ab":
             pl.read_csv(f"{name}.csv").write_parquet(f"{name}.parquet")
@@ -460,6 +462,8 @@ def test_long_logs_give_what_short_ones_give(folder, words, monkeypatch, kind):
     expected = words("inspect", "slow.toml", f"a.{kind}")
     monkeypatch.setattr("jaxid.workflow.log_loading.LONG_LOG_ROWS", 500)
     monkeypatch.setattr("jaxid.workflow.log_loading.read_recording", None)
+    if compiled_rows:
+        monkeypatch.setattr("jaxid.RegressionProblem.compiled_samples", 500)
     words("identify", *arguments, "-o", "long")
     short, long = (result(folder, name) for name in ("short", "long"))
     for key in ("rows", "recordings"):

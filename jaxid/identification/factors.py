@@ -15,26 +15,12 @@ from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-import scipy
 
-from jaxid.arrays import (
-    AnyArray,
-    BaseVector,
-    Float,
-    Indices,
-    Joints,
-    Matrices,
-    Matrix,
-    on_cores,
-)
+from jaxid.arrays import AnyArray, BaseVector, Float, Indices, Joints, Matrices, Matrix
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.measurement.observations import Observations
 
-SAMPLES_PER_CHUNK = 4096
-"""Samples whose columns a core evaluates at once."""
-MAX_GROWTH = 1e4
-"""Squared size of rows, in units of a triangle, up to which products lose no digits."""
 Columns = Sequence[Indices]
 """Indices of the base parameters that can act on each joint."""
 
@@ -52,26 +38,10 @@ class RowChunk(NamedTuple):
     block: int  # index of the block of time, counted over all recordings
     rows: slice  # range of the recording's rows
     indices: Columns  # base parameters that can act on each joint
-    # Columns of each joint, followed by its measured force less that of a known tool
-    # [N m or N], stand one after the other in memory.
-    values: Matrix
+    columns: Matrices  # columns of each joint [rows, indices of the joint]
+    # measured forces less those of a known tool [rows, joints], in [N m] or [N]
+    forces: Matrix
     mask: np.ndarray  # rows that count for each joint [rows, joints]
-
-    @property
-    def systems(self) -> Matrices:
-        """Columns and force of each joint [rows, indices of the joint and force]."""
-        ends = np.cumsum([len(indices) + 1 for indices in self.indices])
-        return np.split(self.values, ends[:-1], axis=1)
-
-    @property
-    def columns(self) -> Matrices:
-        """Columns of each joint [rows, indices of the joint]."""
-        return [system[:, :-1] for system in self.systems]
-
-    @property
-    def forces(self) -> Matrix:
-        """Measured forces less those of a known tool [rows, joints], in [N m or N]."""
-        return np.stack([system[:, -1] for system in self.systems], axis=1)
 
     def part(self, rows: slice) -> "RowChunk":
         """Return the rows of a range of the recording, which lies within the chunk."""
@@ -79,7 +49,8 @@ class RowChunk(NamedTuple):
         selection = slice(rows.start - offset, rows.stop - offset)
         return self._replace(
             rows=rows,
-            values=self.values[selection],
+            columns=[x[selection] for x in self.columns],
+            forces=self.forces[selection],
             mask=self.mask[selection],
         )
 
@@ -96,17 +67,21 @@ class RowChunk(NamedTuple):
         ]
         return self.forces - np.stack(predicted_forces, axis=1)
 
-    def equations(self) -> Iterator[Matrix]:
-        """Yield the rows `[columns, force]` of each joint that count."""
-        for system, mask in zip(self.systems, self.mask.T, strict=True):
-            yield system if mask.all() else system.T[:, mask].T
+    def equations(self) -> Matrices:
+        """Return the rows `[columns, force]` of each joint that count."""
+        joints = zip(self.columns, self.forces.T, self.mask.T, strict=True)
+        return [np.column_stack([theta, force])[mask] for theta, force, mask in joints]
 
 
 def join_chunks(chunks: Sequence[RowChunk]) -> RowChunk:
     """Return the rows of chunks that follow each other in one recording."""
+    columns = [
+        np.concatenate(x) for x in zip(*(c.columns for c in chunks), strict=True)
+    ]
     return chunks[0]._replace(
         rows=slice(chunks[0].rows.start, chunks[-1].rows.stop),
-        values=np.concatenate([chunk.values for chunk in chunks]),
+        columns=columns,
+        forces=np.concatenate([chunk.forces for chunk in chunks]),
         mask=np.concatenate([chunk.mask for chunk in chunks]),
     )
 
@@ -114,7 +89,7 @@ def join_chunks(chunks: Sequence[RowChunk]) -> RowChunk:
 def row_chunks(
     base: BaseParameters,
     observations: Observations,
-    samples: int = SAMPLES_PER_CHUNK,
+    samples: int,
     ranges: Ranges = None,
 ) -> Iterator[RowChunk]:
     """Yield the rows of a recording by chunks of samples, not yet divided (Eq. 26).
@@ -122,35 +97,19 @@ def row_chunks(
     Only some ranges of rows are made, or all.
     """
     mask = np.asarray(observations.mask)
-    low_pass = observations.filter.low_pass(observations.sample_time)
-    memory = low_pass.memory() + observations.decimation.memory()
-    # Parts that are shorter than what filters add to them would take far longer.
-    samples = max(samples, 4 * memory)
-    regressor = base.joint_regressor
-
-    def parts() -> Iterator[tuple]:
-        for chunk in observations.chunks(samples, ranges):
-            yield chunk, *observations.read(slice(*chunk.samples))
-
-    def rows_of(part: tuple) -> RowChunk:
-        chunk, motion, forces = part
+    for chunk in observations.chunks(samples, ranges):
+        motion, forces = observations.read(slice(*chunk.samples))
+        forces = without_tool(base, motion, forces)
         rows = slice(*chunk.rows)
-        arguments = base.model.arguments(motion)
-        columns = regressor.evaluate(*(np.asarray(x, float).T for x in arguments))
-        joint_forces = without_tool(base, motion, forces).T
-        pairs = zip(columns, joint_forces, strict=True)
-        values = np.vstack([array for pair in pairs for array in pair])
-        return RowChunk(
+        yield RowChunk(
             recording=0,
             block=0,
             rows=rows,
-            indices=regressor.columns,
-            values=chunk.reduce(values.T),
+            indices=base.acting_columns,
+            columns=[chunk.reduce(theta) for theta in base.regressor_rows(motion)],
+            forces=chunk.reduce(forces),
             mask=mask[rows],
         )
-
-    # One core makes the rows of a chunk; the next ones are read meanwhile.
-    yield from on_cores(rows_of, parts())
 
 
 def without_tool(base: BaseParameters, motion: Motion, forces: AnyArray) -> Matrix:
@@ -179,21 +138,10 @@ class JointFactor(eqx.Module):
     R: Float[AnyArray, "height width"]
     rows: int = eqx.field(static=True)  # number of rows that were reduced to R
 
-
-def triangle_with_rows(R: Matrix, rows: Matrix) -> Matrix:
-    """Return the R factor of a triangle above more rows.
-
-    Products of many rows take a third of the time of their decomposition. In units of
-    a triangle that knows all directions they lose no digits.
-    """
-    size = R.shape[1]
-    if len(R) == size < len(rows) and np.diag(R).all():
-        # An inverse of the triangle would lose digits where it is almost singular.
-        relative_rows = scipy.linalg.blas.dtrsm(1.0, R, rows, side=1)
-        products = np.eye(size) + relative_rows.T @ relative_rows
-        if np.trace(products) < MAX_GROWTH:
-            return np.linalg.cholesky(products).T @ R
-    return np.asarray(np.linalg.qr(np.vstack([R, rows]), mode="r"))
+    def append(self, rows: Float[AnyArray, "height width"]) -> "JointFactor":
+        """Return the factor after more rows `[columns, force]`."""
+        R = np.asarray(np.linalg.qr(np.vstack([self.R, rows]), mode="r"))
+        return JointFactor(self.columns, R, self.rows + len(rows))
 
 
 class Factors(eqx.Module):
@@ -202,11 +150,16 @@ class Factors(eqx.Module):
     joints: tuple[JointFactor, ...]  # factor of each joint
     size: int = eqx.field(static=True)  # number of base parameters
 
+    def append(self, rows: Matrices) -> "Factors":
+        """Return the factors after more rows `[columns, force]` of each joint."""
+        pairs = zip(self.joints, rows, strict=True)
+        return Factors(tuple(joint.append(x) for joint, x in pairs), self.size)
+
     def __add__(self, other: "Factors") -> "Factors":
         """Return the factors of both sets of rows together."""
         joints = []
         for joint, other_joint in zip(self.joints, other.joints, strict=True):
-            R = triangle_with_rows(np.asarray(joint.R), np.asarray(other_joint.R))
+            R = joint.append(other_joint.R).R
             joints.append(JointFactor(joint.columns, R, joint.rows + other_joint.rows))
         return Factors(tuple(joints), self.size)
 
@@ -241,32 +194,13 @@ class Factors(eqx.Module):
         return np.array([np.sum(joint.R[:, -1] ** 2) for joint in self.joints])
 
 
-class GrowingFactors:
-    """Factors of rows that come one after another.
-
-    Args:
-        columns: Base parameters that can act on each joint.
-        size: Number of base parameters.
-    """
-
-    def __init__(self, columns: Columns, size: int):
-        self._columns = columns
-        self._size = size
-        self._triangles = [np.zeros((0, len(indices) + 1)) for indices in columns]
-        self._counts = [0 for _ in columns]
-
-    def append(self, rows: Iterable[Matrix]) -> None:
-        """Add more rows `[columns, force]` of each joint."""
-        for joint, joint_rows in enumerate(rows):
-            R = triangle_with_rows(self._triangles[joint], joint_rows)
-            self._triangles[joint] = R
-            self._counts[joint] += len(joint_rows)
-
-    def result(self) -> Factors:
-        """Return the factors of all rows so far."""
-        columns = map(tuple, self._columns)
-        joints = map(JointFactor, columns, self._triangles, self._counts)
-        return Factors(tuple(joints), self._size)
+def empty_factors(columns: Columns, size: int) -> Factors:
+    """Return factors of no rows, from each joint's columns and the number of all."""
+    joints = []
+    for indices in columns:
+        no_rows = np.zeros((0, len(indices) + 1))
+        joints.append(JointFactor(tuple(indices), no_rows, 0))
+    return Factors(tuple(joints), size)
 
 
 class Blocks(eqx.Module):

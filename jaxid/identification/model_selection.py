@@ -27,6 +27,8 @@ MIN_LOGS = 4
 """Number of logs from which whole logs are left out, instead of parts of logs."""
 MIN_BLOCKS = 3
 """Blocks of rows without which nothing remains for a fit once a part is left out."""
+SAMPLES_PER_CHUNK = 65536
+"""Samples whose columns are evaluated at once."""
 RIDGE = 1e-9
 """Share of a squared column that keeps parameters without effect small."""
 BODY_RIDGE = 1e-2
@@ -162,7 +164,7 @@ def column_products(
         # Parts of a log follow each other.
         numbers, first_rows = np.unique(row_parts, return_index=True)
         edges = [*first_rows.tolist(), log.rows]
-        for rows in row_chunks(base, observed_log):
+        for rows in row_chunks(base, observed_log, SAMPLES_PER_CHUNK):
             for chunk in rows.divide(edges):
                 part = products[numbers[chunk.block]]
                 joints = zip(chunk.indices, chunk.equations(), weights, strict=True)

@@ -6,22 +6,15 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import BaseVector, Joints, Matrix
+from jaxid.arrays import BaseVector, Joints, Matrices, Matrix
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
 from jaxid.measurement.observations import Observations, ObservedLogs, Progress
 from jaxid.robot.robot import Robot
 
-from .factors import (
-    SAMPLES_PER_CHUNK,
-    Blocks,
-    Factors,
-    GrowingFactors,
-    Ranges,
-    RowChunk,
-    row_chunks,
-)
+from .factors import Blocks, Factors, Ranges, RowChunk, empty_factors, row_chunks
+from .long_logs import stream_blocks, suits
 
 
 class Span(NamedTuple):
@@ -52,10 +45,12 @@ class RegressionProblem:
         names: Names of the recordings; by default their own.
     """
 
-    samples_per_chunk = SAMPLES_PER_CHUNK
+    samples_per_chunk = 65536
     """Samples whose columns are evaluated at once."""
     cached_numbers = 2**26
     """Numbers (half a gigabyte) up to which columns are kept for the next pass."""
+    compiled_samples = 100_000
+    """Samples from which it pays to compile the pass over a recording."""
 
     def __init__(
         self,
@@ -91,8 +86,14 @@ class RegressionProblem:
             return self._initial_blocks
         self.require_rows()
         parts = []
-        for number in range(len(self.recordings)):
-            parts += self._reduce(number, RowChunk.equations)
+        for number, recording in enumerate(self.recordings):
+            # Compiling the pass pays for long recordings with short filters.
+            if recording.samples >= self.compiled_samples and suits(recording):
+                report = functools.partial(self._report, number)
+                edges = self._edges[number]
+                parts += stream_blocks(self.base, recording, edges, report)
+            else:
+                parts += self._reduce(number, RowChunk.equations)
         return Blocks(tuple(parts))
 
     @functools.cached_property
@@ -120,13 +121,13 @@ class RegressionProblem:
 
     def _reduce(self, number: int, equations: Callable):
         """Return the factors of one recording's blocks of time."""
-        columns = self.base.acting_columns
-        blocks = self._edges[number][1:]
-        parts = [GrowingFactors(columns, self.base.size) for _ in blocks]
+        empty_part = empty_factors(self.base.acting_columns, self.base.size)
+        parts = [empty_part] * (len(self._edges[number]) - 1)
         first_block = self._first_block(number)
         for chunk in self.recording_chunks(number):
-            parts[chunk.block - first_block].append(equations(chunk))
-        return [part.result() for part in parts]
+            block = chunk.block - first_block
+            parts[block] = parts[block].append(equations(chunk))
+        return parts
 
     def _first_block(self, number: int) -> int:
         return sum(len(edges) - 1 for edges in self._edges[:number])
@@ -197,11 +198,10 @@ class RegressionProblem:
         """
         self.require_rows()
 
-        def equations(chunk: RowChunk) -> Iterator[Matrix]:
+        def equations(chunk: RowChunk) -> Matrices:
             row_weights = np.sqrt(weight(chunk.residuals(p) / scale))
             joints = zip(chunk.equations(), row_weights.T, chunk.mask.T, strict=True)
-            for rows, roots, mask in joints:
-                yield roots[mask, None] * rows
+            return [roots[mask, None] * rows for rows, roots, mask in joints]
 
         parts = []
         for number in range(len(self.recordings)):

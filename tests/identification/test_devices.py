@@ -1,4 +1,4 @@
-"""Data sets are divided among devices as their arrays are."""
+"""Several devices give what one of them gives."""
 
 import os
 import subprocess
@@ -7,6 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import patience
+import pytest
+from virtual import observations, standard_parameters
+
+import jaxid as jid
+from jaxid.identification import long_logs
 
 HERE = Path(__file__).resolve().parent
 COMMON = """
@@ -14,9 +19,23 @@ import os, sys
 import jax, numpy as np
 jax.config.update("jax_enable_x64", True)
 import jaxid as jid
+from virtual import observations, standard_parameters
 
 terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
 base = jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
+p = standard_parameters(base.model)
+def write(fit):
+    s = fit.naive_standard_deviations
+    np.savez(sys.argv[1], p=fit.parameters, s=s, rows=fit.rows)
+"""
+LONG = """
+assert len(jax.devices()) == 3
+from jaxid.identification import long_logs
+jid.RegressionProblem.compiled_samples, long_logs.PIECE = 1000, 2048
+smooth, shares = jid.ZeroPhaseButterworth(30.0), []
+o = observations(base.model, p, samples=20011, noise=0.3, filter=smooth, every=15)
+write(jid.identify(base, o, jid.estimators.LeastSquares(), progress=shares.append))
+assert shares == sorted(shares) and shares[-1] == 1.0
 """
 DIVIDED = """
 import re
@@ -62,6 +81,34 @@ def start(script, *arguments, flags):
         stderr=subprocess.STDOUT,
         text=True,
     )
+
+
+def assert_same(found, p, deviations, rows):
+    error = np.linalg.norm((found["p"] - p) / deviations)
+    assert error < 1e-12 * np.linalg.norm(p / deviations)
+    np.testing.assert_allclose(found["s"], deviations, rtol=1e-10)
+    np.testing.assert_array_equal(found["rows"], rows)
+
+
+@pytest.fixture(scope="module")
+def base():
+    terms = (jid.RigidBodies(), jid.ViscousFriction(), jid.CoulombFriction())
+    return jid.base_parameters(jid.Model(jid.robots.planar_arm(2, 0.4), terms))
+
+
+def test_a_long_log_on_three_devices_without_asking(base, tmp_path, monkeypatch):
+    process = start(
+        LONG, tmp_path / "3.npz", flags="--xla_force_host_platform_device_count=3"
+    )
+    monkeypatch.setattr(jid.RegressionProblem, "compiled_samples", 1000)
+    monkeypatch.setattr(long_logs, "PIECE", 2048)
+    smooth, p = jid.ZeroPhaseButterworth(30.0), standard_parameters(base.model)
+    o = observations(base.model, p, samples=20011, noise=0.3, filter=smooth, every=15)
+    fit = jid.identify(base, o, jid.estimators.LeastSquares())
+    (output,) = patience.outputs([process])
+    assert process.returncode == 0, output
+    found = np.load(tmp_path / "3.npz")
+    assert_same(found, fit.parameters, fit.naive_standard_deviations, fit.rows)
 
 
 def test_data_sets_are_divided_as_the_inputs_are(tmp_path):

@@ -162,7 +162,7 @@ def test_segments_of_a_log_and_streams_agree(filtered):
         np.testing.assert_allclose(states[a:b], expected, atol=1e-12)
 
     class Streamed(RegressionProblem):
-        samples_per_chunk = 500
+        compiled_samples = 1
 
     plain, streamed = (
         kind(base, log).factors for kind in (RegressionProblem, Streamed)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxid.identification.estimators.regularisation_and_weights import Decomposition
-from jaxid.identification.factors import GrowingFactors
+from jaxid.identification.factors import empty_factors
 
 
 def numbers(text):
@@ -113,10 +113,10 @@ DIGITS = dict(zip(PROBLEMS, (6, 10, 8, 11, 8, 7, 5), strict=True))
 def solved(X, y):
     """By the way that identification takes: a joint's factor, its decomposition."""
     size = X.shape[1]
-    factors = GrowingFactors([tuple(range(size))], size)
+    factors = empty_factors([tuple(range(size))], size)
     for part in np.array_split(np.column_stack([X, y]), 2):
-        factors.append([part])
-    return Decomposition.of(*factors.result().weighted(np.ones(1)))
+        factors = factors.append([part])
+    return Decomposition.of(*factors.weighted(np.ones(1)))
 
 
 def digits(found, known):

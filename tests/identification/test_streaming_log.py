@@ -6,6 +6,7 @@ import pytest
 from virtual import motion, standard_parameters
 
 import jaxid as jid
+from jaxid.identification import long_logs
 from jaxid.measurement.log_files import text_files
 from jaxid.measurement.reading import scan_log
 from jaxid.measurement.time_grid import NeedsMemory
@@ -75,8 +76,11 @@ def agree(base, log, o):
 
 
 @pytest.mark.parametrize("filter", FILTERS)
-def test_parquet(base, parquet, monkeypatch, filter):
+@pytest.mark.parametrize("long", [1000, 100_000])
+def test_parquet_compiled_and_in_numpy(base, parquet, monkeypatch, long, filter):
     monkeypatch.setattr(jid.RegressionProblem, "samples_per_chunk", 3000)
+    monkeypatch.setattr(jid.RegressionProblem, "compiled_samples", long)
+    monkeypatch.setattr(long_logs, "PIECE", 4096)
     log = scan_log(parquet, COLUMNS, base.model.robot, filter, EVERY)
     agree(base, log, in_memory(base, parquet, EVERY, filter))
 

@@ -7,6 +7,7 @@ much of it the fit has explained, and the power of the residuals.
 
 import itertools
 import math
+import os
 from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
@@ -202,7 +203,9 @@ def row_spectra(problem: RegressionProblem, estimate: Estimate) -> RowSpectra:
 
     # This thread makes the rows of the next stretch while others transform the channels
     # of one.
-    for task, spectra in on_cores(transform, channels()):
+    other_cores = max(1, (os.cpu_count() or 1) - 1)
+    joints = problem.robot.joints
+    for task, spectra in on_cores(transform, channels(), other_cores, joints):
         c = task.number
         task.lines.add_channel(c, spectra)
         inverses[c] = estimate.inverse[:, list(task.channel.columns)]
