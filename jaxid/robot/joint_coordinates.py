@@ -10,8 +10,7 @@ closing the loops.
 """
 
 import functools
-import itertools
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -39,16 +38,36 @@ from .rotations import rotation_about
 
 PARTS_OF_WAY = 24
 """Points on the way to random coordinates at which it is checked."""
-APPROACH_STEPS = 8
-"""Parts of the motors' way from the robot's `loop_pose`, with one Newton step each."""
-THOROUGH_STEPS = 24
-"""The same for samples whose loops do not close by these."""
-NEWTON_STEPS = 6
-"""Newton's steps behind this way."""
+
+
+class ClosingSteps(NamedTuple):
+    """Newton's steps that close loops.
+
+    Attributes:
+        parts: Parts of the motors' way from the robot's `loop_pose`, with one step
+            each. If 0, the loops start where they would be if their coordinates were
+            quadratic functions of the motors'.
+        last: Steps behind this way.
+    """
+
+    parts: int
+    last: int
+
+
+QUICK = ClosingSteps(0, 4)
+"""Steps for many samples: sines and cosines of all steps take most of the time."""
+STANDARD = ClosingSteps(8, 6)
+"""Steps for one sample in a program, and for samples that the quick ones miss."""
+THOROUGH = ClosingSteps(24, 6)
+"""Steps for samples whose loops do not close by the standard ones."""
 MAX_CHANGE = 0.5
 """Largest change of a joint in one of these steps [rad or m]."""
 MAX_GAP = {"float64": 1e-12, "float32": 1e-4}
 """Distance between two points of a loop up to which it is closed, by precision [m]."""
+MAX_QUICK_GAP = 1e-7
+"""Distance that the last of the quick steps still closes, as it squares it [m]."""
+MAX_QUICK_WAY = 1.0
+"""Way of a motor from the robot's `loop_pose` up to which they are used [rad or m]."""
 MIN_CLOSING_SHARE = 1e-4
 """Determinant of closing relative to that of the description; below, it is singular."""
 MIN_SAFE_SHARE = 0.2
@@ -89,22 +108,12 @@ def with_leader(followers: Followers) -> Followers:
 
 def linear_coordinates(followers: Followers, q: ManyJoints) -> AnyArray:
     """Return the coordinates of all joints but those that loops move."""
-    return _joined(
-        q, [f.factor * q[..., f.leader] + f.offset for f in with_leader(followers)]
-    )
-
-
-def _linear_rates(followers: Followers, qd: ManyJoints) -> AnyArray:
-    """Return the velocities or accelerations of these joints."""
-    return _joined(qd, [f.factor * qd[..., f.leader] for f in with_leader(followers)])
-
-
-def _joined(values: AnyArray, follower_values: list):
-    """Append the values of followers along the last axis."""
-    if not follower_values:
-        return values
-    xp = namespace(values)
-    return xp.concatenate([values, xp.stack(follower_values, axis=-1)], axis=-1)
+    led_followers = with_leader(followers)
+    if not led_followers:
+        return q
+    xp = namespace(q)
+    values = [f.factor * q[..., f.leader] + f.offset for f in led_followers]
+    return xp.concatenate([q, xp.stack(values, axis=-1)], axis=-1)
 
 
 def at_sample(robot: Any, q: Joints) -> tuple[Any, Joints]:
@@ -134,15 +143,14 @@ def all_coordinates(robot: Any, q: Joints) -> AnyArray:
 
 def all_rates(robot: Any, q: Joints, qd: Joints) -> AnyArray:
     r"""Return the velocities of all joints, $\Gamma \dot y$."""
-    rates = _linear_rates(robot.followers, qd)
-    if not robot.loops:
-        return rates
-    return jnp.concatenate([rates, _loop_ratios(robot, q) @ qd])
+    if not robot.followers:
+        return qd
+    return jnp.asarray(speed_ratios(robot, q), qd.dtype) @ qd
 
 
 def all_accelerations(robot: Any, q: Joints, qd: Joints, qdd: Joints) -> AnyArray:
     r"""Return the accelerations of all joints, $\Gamma \ddot y + \dot\Gamma \dot y$."""
-    accelerations = _linear_rates(robot.followers, qdd)
+    accelerations = all_rates(robot, q, qdd)
     if not robot.loops:
         return accelerations
     coordinates = all_coordinates(robot, q)
@@ -153,9 +161,10 @@ def all_accelerations(robot: Any, q: Joints, qd: Joints, qdd: Joints) -> AnyArra
         return jax.jvp(gaps, (coordinates,), (rates,))[1]
 
     _, gap_accelerations = jax.jvp(gap_rates, (coordinates,), (rates,))
-    _, slopes = gap_slopes(robot, coordinates)
+    free_slopes, slopes = gap_slopes(robot, coordinates)
     bias = solve_columns(slopes, -gap_accelerations)
-    return jnp.concatenate([accelerations, _loop_ratios(robot, q) @ qdd + bias])
+    other_joints = free_slopes.shape[1]
+    return accelerations + jnp.pad(bias, (other_joints, 0))
 
 
 def speed_ratios(robot: Any, q: Joints) -> AnyArray:
@@ -163,7 +172,8 @@ def speed_ratios(robot: Any, q: Joints) -> AnyArray:
     ratios = linear_ratios(robot.followers, robot.joints)
     if not robot.loops:
         return ratios
-    return jnp.concatenate([ratios, _loop_ratios(robot, q)])
+    free_slopes, slopes = gap_slopes(robot, all_coordinates(robot, q))
+    return jnp.concatenate([ratios, solve_columns(slopes, -free_slopes @ ratios)])
 
 
 def on_coordinates(robot: Any, q: Joints, rows: Any) -> Any:
@@ -172,13 +182,6 @@ def on_coordinates(robot: Any, q: Joints, rows: Any) -> Any:
         return rows
     ratios = jnp.asarray(speed_ratios(robot, q), rows.dtype)
     return jnp.tensordot(ratios.T, rows, 1)
-
-
-def _loop_ratios(robot: Any, q: Joints):
-    """Return the speeds of the joints that loops move by those of the coordinates."""
-    free_slopes, slopes = gap_slopes(robot, all_coordinates(robot, q))
-    ratios = linear_ratios(robot.followers, robot.joints)
-    return solve_columns(slopes, -free_slopes @ ratios)
 
 
 def loop_gaps(robot: Any, coordinates: Joints) -> Array:
@@ -228,9 +231,7 @@ def _place_on(robot: Any, coordinates: Joints, body: int, point: Vector3, carrie
 
 
 @functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
-def closed_coordinates(
-    robot: Any, q: Joints, approach_steps: int = APPROACH_STEPS
-) -> Array:
+def closed_coordinates(robot: Any, q: Joints, steps: ClosingSteps = STANDARD) -> Array:
     """Return the coordinates of all joints, at which the loops are closed.
 
     The motors go to their coordinates in equal parts, and the loops follow: so they
@@ -240,31 +241,48 @@ def closed_coordinates(
     pose = jnp.asarray(robot.loop_pose, q.dtype)
     start = pose[: robot.joints]
     change = q - start
-    if robot.bodies == robot.joints + joints:
+    loop_coordinates = pose[-joints:]
+    if not steps.parts:
+        loop_coordinates = _extrapolated(robot, pose, change)[-joints:]
+    elif robot.bodies == robot.joints + joints:
         # A full turn of a motor changes nothing, if no joint follows it by a ratio.
         turn = jnp.arctan2(jnp.sin(change), jnp.cos(change))
         change = jnp.where(np.array(robot.revolute), turn, change)
+    end = start + change if steps.parts else q
 
     def step(k, loop_coordinates):
-        share = jnp.minimum((k + 1) / approach_steps, 1.0)
-        other_coordinates = linear_coordinates(robot.followers, start + share * change)
+        # Behind the way these are exactly the motors' coordinates, whose sines and
+        # cosines are computed once.
+        rest = 1.0 - jnp.minimum((k + 1) / max(steps.parts, 1), 1.0)
+        other_coordinates = linear_coordinates(robot.followers, end - rest * change)
         coordinates = jnp.concatenate([other_coordinates, loop_coordinates])
-        _, slopes = gap_slopes(robot, coordinates)
-        newton_step = solve_columns(slopes, -closing_rows(robot, coordinates))
-        newton_step = jnp.minimum(jnp.maximum(newton_step, -MAX_CHANGE), MAX_CHANGE)
-        return loop_coordinates + newton_step
+        return loop_coordinates + _newton_step(robot, coordinates)
 
-    steps = approach_steps + NEWTON_STEPS
-    loop_coordinates = jax.lax.fori_loop(0, steps, step, pose[-joints:])
+    loop_coordinates = jax.lax.fori_loop(0, sum(steps), step, loop_coordinates)
     other_coordinates = linear_coordinates(robot.followers, q)
     return jnp.concatenate([other_coordinates, loop_coordinates])
 
 
+def _newton_step(robot: Any, coordinates: Joints):
+    """Return the changes of the joints that loops move, which close them."""
+    _, slopes = gap_slopes(robot, coordinates)
+    change = solve_columns(slopes, -closing_rows(robot, coordinates))
+    return jnp.minimum(jnp.maximum(change, -MAX_CHANGE), MAX_CHANGE)
+
+
+def _extrapolated(robot: Any, pose: Joints, change: Joints) -> AnyArray:
+    """Return the coordinates of all joints to second order around a closed pose."""
+    robot, start = at_sample(robot, pose)
+    rates = all_rates(robot, start, change)
+    curvature = all_accelerations(robot, start, change, jnp.zeros_like(change))
+    return pose + rates + curvature / 2
+
+
 @closed_coordinates.defjvp
-def _closed_rates(approach_steps: int, primals: tuple, tangents: tuple):
+def _closed_rates(steps: ClosingSteps, primals: tuple, tangents: tuple):
     """Return the coordinates and their rates, by the implicit function theorem."""
     robot, _ = primals
-    coordinates = closed_coordinates(*primals, approach_steps)
+    coordinates = closed_coordinates(*primals, steps)
     joints = len(robot.loop_rows)
     loop_coordinates = coordinates[-joints:]
 
@@ -303,23 +321,13 @@ def solve_columns(A: Array, b: Array) -> Array:
 
 
 def determinant(A: Array) -> Array:
-    """Return a determinant by minors of the first rows, row by row.
-
-    Without divisions: it changes its sign smoothly. Zeros cost nothing in a program.
-    """
-    n = len(A)
-    minors: dict[tuple[int, ...], Any] = {(): jnp.ones((), A.dtype)}
-    for row in range(n):
-        larger_minors = {}
-        for columns in itertools.combinations(range(n), row + 1):
-            total = 0.0
-            for place, column in enumerate(columns):
-                remaining_columns = columns[:place] + columns[place + 1 :]
-                sign = (-1.0) ** (row - place)
-                total = total + sign * A[row, column] * minors[remaining_columns]
-            larger_minors[columns] = total
-        minors = larger_minors
-    return minors[tuple(range(n))]
+    """Return the determinant of a matrix near the identity, by elimination."""
+    pivots = []
+    while len(A):
+        pivots.append(A[0, 0])
+        factors = A[1:, 0] / A[0, 0]
+        A = A[1:, 1:] - factors[:, None] * A[:1, 1:]
+    return jnp.prod(jnp.stack(pivots))
 
 
 def loop_closure(robot: Any, coordinates: Joints) -> Array:
@@ -333,7 +341,7 @@ def loop_closure(robot: Any, coordinates: Joints) -> Array:
     _, slopes = gap_slopes(robot, coordinates)
     pose = jnp.asarray(robot.loop_pose, coordinates.dtype)
     _, slopes_of_pose = gap_slopes(robot, pose)
-    share = determinant(slopes) / determinant(slopes_of_pose)
+    share = determinant(solve_columns(slopes_of_pose, slopes))
     return jnp.stack([gaps @ gaps, share])
 
 
@@ -341,13 +349,19 @@ class Closure(eqx.Module):
     """Closing of the loops of a robot."""
 
     robot: Any
-    approach_steps: int = eqx.field(static=True, default=APPROACH_STEPS)
+    steps: ClosingSteps = eqx.field(static=True, default=STANDARD)
 
     def of_sample(self, q: Joints) -> Array:
         """Return the coordinates of all joints of one sample, and `loop_closure`."""
         robot = self.robot
-        coordinates = closed_coordinates(robot, q, self.approach_steps)
-        return jnp.concatenate([coordinates, loop_closure(robot, coordinates)])
+        coordinates = closed_coordinates(robot, q, self.steps)
+        closure = loop_closure(robot, coordinates)
+        if self.steps is QUICK:
+            # What the closure has computed gives one more step.
+            change = _newton_step(robot, coordinates)
+            others = jnp.zeros(robot.bodies - len(change))
+            coordinates = coordinates + jnp.concatenate([others, change])
+        return jnp.concatenate([coordinates, closure])
 
     def of_samples(self, q: ManyJoints) -> AnyArray:
         """Return the same of many samples; in float64 for NumPy's arrays."""
@@ -367,11 +381,16 @@ def close_loops(robot: Any, q: Numbers) -> ManyJoints:
         )
     if not robot.loops:
         return linear_coordinates(robot.followers, q)
-    closure = Closure(robot).of_samples(q)
-    is_closed = _is_closed(closure)
-    if isinstance(closure, np.ndarray) and not is_closed.all():
-        thorough_closing = Closure(robot, THOROUGH_STEPS)
-        closure[~is_closed] = thorough_closing.of_samples(q[~is_closed])
+    if isinstance(q, np.ndarray):
+        closure = Closure(robot, QUICK).of_samples(q)
+        is_closed = _is_quickly_closed(robot, q, closure)
+        for steps in (STANDARD, THOROUGH):
+            if not is_closed.all():
+                is_open = ~is_closed
+                closure[is_open] = Closure(robot, steps).of_samples(q[is_open])
+                is_closed = _is_closed(closure)
+    else:
+        closure = Closure(robot).of_samples(q)
         is_closed = _is_closed(closure)
     coordinates = closure[..., : robot.bodies]
     if is_traced(closure):
@@ -389,6 +408,14 @@ def _is_closed(closure: AnyArray, min_share: float = MIN_CLOSING_SHARE):
     """Return whether loops close, on the branch of the description."""
     max_gap = MAX_GAP[closure.dtype.name]
     return (closure[..., -2] <= max_gap**2) & (closure[..., -1] > min_share)
+
+
+def _is_quickly_closed(robot: Any, q: np.ndarray, closure: np.ndarray):
+    """Return whether quick steps surely close loops, and as precisely as others."""
+    start = np.asarray(robot.loop_pose)[: robot.joints]
+    is_near = np.abs(q - start).max(axis=-1) <= MAX_QUICK_WAY
+    is_precise = closure[..., -2] <= MAX_QUICK_GAP**2
+    return _is_closed(closure, MIN_SAFE_SHARE) & is_near & is_precise
 
 
 def reachable(robot: Any, q: np.ndarray) -> np.ndarray:
