@@ -12,8 +12,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, JointSamples
 from jaxid.dynamics.motion import Motion
+from jaxid.robot.limits_and_drives import of_joints
 from jaxid.robot.robot import Robot
-from jaxid.robot.virtual_joints import driven_drives
 
 from .time_grid import Range
 
@@ -117,7 +117,7 @@ def joint_side(
 
     `log` is a recording, or `Columns`.
     """
-    drives = driven_drives(robot)
+    drives = of_joints(robot.drives, robot.driven)
     q = np.asarray(angles)
     qd = None if velocities is None else np.asarray(velocities)
     forces = np.asarray(forces)

@@ -10,6 +10,7 @@ from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
+import numpy as np
 
 from jaxid.arrays import AnyArray, Float, Indices, as_finite_array, given
 from jaxid.errors import InputError
@@ -260,17 +261,11 @@ def loops_of_bodies(tree: Any, loops: Sequence[Any]) -> Iterator[Loop]:
         carriers = [tree.carriers.get(link) for link in loop.links]
         if None in carriers or carriers[0].body == carriers[1].body:
             continue
-        if loop.points is None:
-            first_link, second_link = loop.links
-            raise InputError(
-                f"the constraint `{loop.name}` between `{first_link}` and "
-                f"`{second_link}` closes a loop, and holds the attitude too: cut the "
-                "loop at a joint and close it by `<connect>`, avoid it (`tip`, "
-                "`--tip`), or remove it."
-            )
         points = [
-            carrier.position + carrier.rotation @ point
-            for carrier, point in zip(carriers, loop.points, strict=True)
+            carrier.position + points @ carrier.rotation.T
+            for carrier, points in zip(carriers, loop.points, strict=True)
         ]
         bodies = (carriers[0].body, carriers[1].body)
-        yield Loop(loop.name, bodies=bodies, points=points)
+        for number, pair in enumerate(zip(*points, strict=True), 1):
+            name = loop.name if number == 1 else f"{loop.name} {number}"
+            yield Loop(name, bodies=bodies, points=np.array(pair))

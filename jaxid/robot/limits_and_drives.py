@@ -276,6 +276,17 @@ def _require_ranges(low: np.ndarray, high: np.ndarray):
         )
 
 
+def of_joints(owner: Any, joints: Sequence[int]) -> Any:
+    """Return limits or drives of some joints alone."""
+    fields = {}
+    for field in dataclasses.fields(owner):
+        values = getattr(owner, field.name, None)
+        if isinstance(values, np.ndarray):
+            axes = [joints] * values.ndim
+            fields[field.name] = values[np.ix_(*axes)]
+    return dataclasses.replace(owner, joints=len(joints), **fields)
+
+
 def complete_limits(robot: Any) -> Limits:
     """Return the limits of a robot, with assumed ones for those that are unknown.
 

@@ -1,10 +1,12 @@
 """Closed loops of a robot: the joints that they move, and the pose that closes them."""
 
 import dataclasses
+import functools
 from collections.abc import Callable, Sequence
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 import scipy
 
@@ -13,8 +15,13 @@ from jaxid.errors import InputError
 from jaxid.program import evaluate, trace
 
 from .follower_joints import Follower, Loop, bodies_in_loop
-from .joint_coordinates import linear_ratios, loop_gaps, with_leader
-from .limits_and_drives import listed
+from .joint_coordinates import (
+    linear_coordinates,
+    linear_ratios,
+    loop_gaps,
+    with_leader,
+)
+from .limits_and_drives import listed, of_joints
 from .robot import Robot
 
 
@@ -124,22 +131,11 @@ def _renumbered(
         offset=robot.offset[order],
         followers=tuple(followers),
         loops=tuple(renumbered_loops),
-        limits=_of_joints(robot.limits, alone),
-        drives=_of_joints(robot.drives, alone),
+        limits=of_joints(robot.limits, alone),
+        drives=of_joints(robot.drives, alone),
         tip_body=numbers[robot.tip_body],
         tool=tool,
     )
-
-
-def _of_joints(owner: Any, joints: list[int]):
-    """Return the limits or drives of some joints."""
-    fields = {}
-    for field in dataclasses.fields(owner):
-        values = getattr(owner, field.name, None)
-        if isinstance(values, np.ndarray):
-            axes = [joints] * values.ndim
-            fields[field.name] = values[np.ix_(*axes)]
-    return dataclasses.replace(owner, **fields)
 
 
 def assembled(robot: Robot, poses: Sequence[AnyArray]) -> Robot:
@@ -148,36 +144,87 @@ def assembled(robot: Robot, poses: Sequence[AnyArray]) -> Robot:
     Args:
         robot: Robot with loops, whose last followers are the joints that these move.
         poses: Coordinates of all its joints, of which the first ones count at which all
-            loops are closed.
+            loops are closed, or else those at which they are the least open.
 
     Raises:
-        InputError: If the loops are open in all poses, or the motors do not suit them.
+        InputError: If the loops do not close, or the motors do not suit them.
     """
     moved = robot.bodies - robot.joints - len(with_leader(robot.followers))
     if not moved:
         # All joints of the loops follow others, so that they are closed.
         return robot.replace(loops=())
-    gaps = [_of_pose(lambda q: loop_gaps(robot, q), pose) for pose in poses]
-    distances = np.linalg.norm(np.reshape(gaps, (len(poses), -1, 3)), axis=-1)
-    widest = distances.max(axis=1)
-    is_closed = widest <= THRESHOLDS.max_gap
-    place = int(is_closed.argmax() if is_closed.any() else widest.argmin())
-    loop = int(distances[place].argmax())
-    open_error = InputError(
-        f"loop `{robot.loops[loop].name}` of `{robot.name}` does not close in its "
-        f"pose: the points that must coincide are {widest[place]:.3g} m apart; give a "
-        "pose in which all loops close (a `<key>` in MJCF, `pose` in Python)."
-    )
-    if not is_closed.any():
-        raise open_error
-    pose = poses[place]
+    robot, pose = _closed(robot, poses, moved)
     slopes = _of_pose(jax.jacfwd(lambda q: loop_gaps(robot, q)), pose)
     rows = _independent_rows(robot, slopes, moved)
     robot = robot.replace(loop_rows=rows, loop_pose=pose)
-    try:
-        return robot.replace(loop_pose=robot.close(pose[: robot.joints]))
-    except InputError:
-        raise open_error from None
+    return robot.replace(loop_pose=robot.close(pose[: robot.joints]))
+
+
+def _closed(
+    robot: Robot, poses: Sequence[AnyArray], moved: int
+) -> tuple[Robot, AnyArray]:
+    """Return the first pose that closes the loops, or one near the least open pose.
+
+    Of the latter the robot has a note.
+
+    Raises:
+        InputError: If no pose near the best one closes the loops.
+    """
+    joints = robot.joints
+    moves_itself = np.r_[:joints, robot.bodies - moved : robot.bodies]
+
+    def gaps(values):
+        leading = linear_coordinates(robot.followers, values[:joints])
+        return loop_gaps(robot, jnp.concatenate([leading, values[joints:]]))
+
+    shape = moves_itself.shape
+    gap_program = trace(gaps, shape)
+    slope_program = trace(jax.jacfwd(gaps), shape)
+
+    def distances(values):
+        return np.linalg.norm(evaluate(gap_program, values).reshape(-1, 3), axis=1)
+
+    widest_gaps = [distances(pose[moves_itself]).max() for pose in poses]
+    for pose, gap in zip(poses, widest_gaps, strict=True):
+        if gap <= THRESHOLDS.max_gap:
+            return robot, pose
+    pose = poses[int(np.argmin(widest_gaps))]
+    followers = robot.followers[-moved:]
+    low = [*robot.limits.position_min, *(x.position_min for x in followers)]
+    high = [*robot.limits.position_max, *(x.position_max for x in followers)]
+    closing = scipy.optimize.least_squares(
+        functools.partial(evaluate, gap_program),
+        np.clip(pose[moves_itself], low, high),
+        jac=functools.partial(evaluate, slope_program),
+        bounds=(low, high),
+    )
+    _require_closed(robot, distances(closing.x))
+    leading = linear_coordinates(robot.followers, closing.x[:joints])
+    pose = np.concatenate([leading, closing.x[joints:]])
+    return _with_note(robot, pose), pose
+
+
+def _require_closed(robot: Robot, distances: np.ndarray) -> None:
+    """Reject loops whose points do not meet near a pose."""
+    if distances.max() > THRESHOLDS.max_gap:
+        loop = robot.loops[int(distances.argmax())]
+        raise InputError(
+            f"loop `{loop.name}` of `{robot.name}` does not close: near its pose the "
+            f"points that must coincide stay {distances.max():.3g} m apart; give a "
+            "pose in which all loops close (a `<key>` in MJCF, `pose` in Python)."
+        )
+
+
+def _with_note(robot: Robot, pose: np.ndarray) -> Robot:
+    """Return the robot with a note on a pose that its description does not state."""
+    coordinates = zip(robot.body_names, pose, strict=True)
+    places = ", ".join(f"`{name}` {value:.4g}" for name, value in coordinates)
+    note = (
+        "the loops are open in all poses of the description; they were closed from the "
+        f"nearest one, at {places}: check the branch, such as elbows up, or give a "
+        "pose in which they are closed (a `<key>`, `pose`)."
+    )
+    return robot.replace(notes=(*robot.notes, note))
 
 
 def _of_pose(function: Callable, pose: AnyArray) -> np.ndarray:

@@ -45,6 +45,9 @@ EFFECTS = {
 }
 """Arrays of effects beside the default model: kind of the elements, and words."""
 
+WELD_CORNERS = np.array([[0.0, 0.0, 0.0], [0.1, 0.0, 0.0], [0.0, 0.1, 0.0]])
+"""Points of a frame that coincide if the frames of two bodies do [m]."""
+
 
 class Effect(NamedTuple):
     """An effect on forces that the default model leaves out.
@@ -68,12 +71,13 @@ class LinkLoop(NamedTuple):
     Attributes:
         name: Name of the constraint.
         links: The two links that it connects.
-        points: The points of these that coincide; None if it holds their attitude too.
+        points: Points of both that coincide [2 points 3]: one, or three if the
+            constraint holds their attitude too.
     """
 
     name: str
     links: tuple[str, str]
-    points: np.ndarray | None
+    points: np.ndarray
 
 
 class Description(NamedTuple):
@@ -347,18 +351,29 @@ class _Writer:
         if kind == kinds.mjEQ_JOINT:
             self._add_mimic(first_object, second_object, model.eq_data[constraint, :5])
         elif kind in (kinds.mjEQ_CONNECT, kinds.mjEQ_WELD):
+            is_weld = kind == kinds.mjEQ_WELD
             bodies = np.array([first_object, second_object])
-            points = model.eq_data[constraint, :6].reshape(2, 3)
+            data = model.eq_data[constraint]
+            points = data[:6].reshape(2, 3)
+            quaternions = np.eye(4)[[0, 0]]
             if model.eq_objtype[constraint] == self._mujoco.mjtObj.mjOBJ_SITE:
                 points = model.site_pos[bodies]
+                quaternions = model.site_quat[bodies]
                 bodies = model.site_bodyid[bodies]
+            elif is_weld:
+                # MuJoCo stores the point of the second body first.
+                points = points[::-1]
+                quaternions[0] = data[6:10]
             # A mocap body is moved by a program: it is no part of the robot.
             if (model.body_mocapid[bodies] < 0).all():
                 name = self._name("equality", constraint)
                 links = (self._links[bodies[0]], self._links[bodies[1]])
-                is_point = kind == kinds.mjEQ_CONNECT
-                loop = LinkLoop(name, links, points.copy() if is_point else None)
-                self.loops.append(loop)
+                corners = WELD_CORNERS[: 3 if is_weld else 1]
+                ends = [
+                    point + corners @ rotation_of_quaternion(quaternion).T
+                    for point, quaternion in zip(points, quaternions, strict=True)
+                ]
+                self.loops.append(LinkLoop(name, links, np.array(ends)))
         elif kind == kinds.mjEQ_TENDON:
             name = self._name("equality", constraint)
             self.effects.append(Effect("constraint", name, "a relation of tendons", ""))

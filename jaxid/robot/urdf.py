@@ -402,19 +402,22 @@ def _held_notes(tree: UrdfTree):
 def _follower_notes(tree: UrdfTree):
     """Return notes on joints that follow others and move bodies of the robot."""
     first_number = len(_leading_joints(tree)) + 1
-    for number, follower in enumerate(tree.followers, first_number):
-        if follower.leader is None:
-            yield (
-                f"joint `{follower.name}`: closed loops move it with the "
-                f"motors; its body has the number {number} (`m{number}`)."
-            )
-            continue
+    led_followers = with_leader(tree.followers)
+    for number, follower in enumerate(led_followers, first_number):
         leader_name = tree.joints[follower.leader].get("name")
         yield (
             f"joint `{follower.name}`: follows another one, at {follower.factor:.4g} * "
             f"`{leader_name}` + {follower.offset:.4g}; its body has the number "
             f"{number} (`m{number}`); its friction is included in that of "
             f"`{leader_name}`."
+        )
+    first_moved = first_number + len(led_followers)
+    names = [x.name for x in tree.followers[len(led_followers) :]]
+    if names:
+        yield (
+            f"{owners('joint', names)}: closed loops move what has no motor; the "
+            f"numbers of the bodies, such as `m{first_moved}`, are from {first_moved} "
+            f"to {len(tree.joints)} in this order."
         )
 
 

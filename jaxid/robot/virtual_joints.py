@@ -16,6 +16,8 @@ from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from jaxid.arrays import Matrix3, Vector3
 from jaxid.errors import InputError
 
+from .limits_and_drives import of_joints
+
 GROUP = 6
 """Number of joints of a group."""
 FORCE_NAMES = ("fx", "fy", "fz", "mx", "my", "mz")
@@ -188,30 +190,11 @@ def padded(owner: Any, before: int, after: int) -> Any:
     return dataclasses.replace(owner, joints=joints, **fields)
 
 
-def driven_drives(robot: Any) -> Any:
-    """Return the drives of the joints that are not virtual."""
-    drives = robot.drives
-    if not robot.virtual:
-        return drives
-    driven = np.array(robot.driven)
-    fields = {}
-    for field in dataclasses.fields(drives):
-        values = getattr(drives, field.name, None)
-        if isinstance(values, np.ndarray):
-            fields[field.name] = values[np.ix_(*[driven] * values.ndim)]
-    return dataclasses.replace(drives, joints=len(driven), **fields)
-
-
 def driven_robot(robot: Any) -> Any:
     """Return the driven joints as a robot of their own, for what logs hold of them."""
     if not robot.virtual:
         return robot
     joints = list(robot.driven)
-    limits = {}
-    for field in dataclasses.fields(robot.limits):
-        values = getattr(robot.limits, field.name, None)
-        if isinstance(values, np.ndarray):
-            limits[field.name] = values[joints]
     return robot.replace(
         joint_names=tuple(robot.joint_names[i] for i in joints),
         parent=None,
@@ -220,8 +203,8 @@ def driven_robot(robot: Any) -> Any:
         axis=robot.axis[joints],
         rotation=robot.rotation[joints],
         offset=robot.offset[joints],
-        limits=dataclasses.replace(robot.limits, joints=len(joints), **limits),
-        drives=driven_drives(robot),
+        limits=of_joints(robot.limits, joints),
+        drives=of_joints(robot.drives, joints),
         tool=None,
         tip_body=None,
         virtual=(),

@@ -161,12 +161,61 @@ def test_loops_of_the_api_are_those_of_the_file(tmp_path):
 def test_files_whose_loops_do_not_close_are_one_sentence(tmp_path):
     mechanism = MECHANISMS["five-bar"]
     path = tmp_path / "mechanism.xml"
-    path.write_text(mjcf(mechanism, mechanism.pose | {"a2": 0.0}))
+    path.write_text(mjcf(mechanism, mechanism.pose).replace(".3 0 0", ".02 0 0", 1))
+    far = 'pos="4 0 0"><joint name="b1"'
+    path.write_text(path.read_text().replace('pos=".1 0 0"><joint name="b1"', far))
     with pytest.raises(InputError, match=r"loop `pin` of .* m apart; give a pose"):
         jid.load_mjcf(path)
     path.write_text(mjcf(mechanism, mechanism.pose, motors=("a1",)))
     with pytest.raises(InputError, match=r"have 2 freedom.* but 1 motor.* at `a1`"):
         jid.load_mjcf(path)
+
+
+def test_open_loops_are_closed_from_the_nearest_pose_which_a_note_states(tmp_path):
+    mechanism = MECHANISMS["five-bar"]
+    path = tmp_path / "mechanism.xml"
+    path.write_text(mjcf(mechanism, mechanism.pose | {"a2": -1.4, "b1": 0.8}))
+    robot = jid.load_mjcf(path)
+    model = mechanism.tree()
+    data = mujoco.MjData(model)
+    for name, value in zip(robot.body_names, robot.loop_pose, strict=True):
+        data.joint(name).qpos = value
+    mujoco.mj_forward(model, data)
+    first_point, second_point = data.site_xpos
+    np.testing.assert_allclose(first_point, second_point, atol=1e-12)
+    expected = [mechanism.pose[name] for name in robot.body_names]
+    np.testing.assert_allclose(robot.loop_pose, expected, atol=0.2)
+    assert any("closed from the nearest" in note for note in robot.notes)
+
+
+def test_a_body_that_a_weld_joins_is_that_of_a_joint(tmp_path):
+    """The rod of the five-bar is cut behind its joint, and welded to its other part."""
+    mechanism = MECHANISMS["five-bar"]
+    path = tmp_path / "mechanism.xml"
+    path.write_text(mechanism.text)
+    robot = jid.load_mjcf(path)
+    part = (
+        '<body name="part" pos=".3 0 0" euler="0 -.5 0"><joint name="part" '
+        'axis="0 -1 0"/><geom size=".01" mass="1"/></body>'
+    )
+    text = mechanism.text.replace('<site name="e1"', f'{part}<site name="e1"')
+    weld = (
+        '<weld name="pin" body1="b2" body2="part" relpose=".3 0 0 '
+        f'{np.cos(0.4)} 0 {np.sin(0.4)} 0"/>'
+    )
+    text = text.replace('<connect name="pin" site1="e1" site2="e2"/>', weld)
+    path.write_text(text[: text.index("<keyframe>")] + "</mujoco>")
+    welded = jid.load_mjcf(path)
+    assert welded.joint_names == robot.joint_names
+    q = np.add(welded.loop_pose[:2], [[0.0, 0.0], [0.02, -0.03]])
+    model = mujoco.MjModel.from_xml_path(str(path))
+    data = mujoco.MjData(model)
+    for pose in welded.close(q):
+        for name, value in zip(welded.body_names, pose, strict=True):
+            data.joint(name).qpos = value
+        mujoco.mj_forward(model, data)
+        # The three forces and three turns of the constraint.
+        np.testing.assert_allclose(data.efc_pos[:6], 0.0, atol=1e-9)
 
 
 @pytest.mark.parametrize("mechanism", [MECHANISMS["palletiser"]])
