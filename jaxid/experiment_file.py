@@ -97,6 +97,7 @@ KEYS: dict[str, TomlTable] = {
         "sign": float,
         "rotation": Vector,
         "position": Vector,
+        "in_ground": bool,
     },
     "limits": {
         "angle_unit": ANGLE_UNIT,

@@ -2,12 +2,14 @@
 
 import json
 
+import jax
 import numpy as np
 import pytest
 from test_cli import refused, run  # noqa: F401
 from wrench_logs import BIAS, LOAD, ROBOT, TURN, noisy, poses, wrench
 
 import jaxid as jid
+from jaxid.robot.forward_kinematics import tip_placement
 
 URDF = "".join(
     f"""<link name="l{i}"/><joint name="j{i + 1}" type="continuous">
@@ -73,6 +75,31 @@ def test_a_payload_behind_a_sensor_needs_one_log(cell, run, tmp_path, monkeypatc
     # The table that subtracts the load is that of the end-effector.
     assert "[robot.tool]" in out
     assert "body =" not in out
+
+
+def test_a_wrench_along_the_axes_of_the_ground_is_turned(cell):
+    time, *columns = np.loadtxt(cell / "short.csv", delimiter=",", skiprows=1).T
+    angles = np.array(columns[:3]).T
+    R = jax.vmap(lambda q: tip_placement(ROBOT, q)[0])(angles)
+    parts = np.array(columns[3:]).T.reshape(-1, 2, 3)
+    turned = np.einsum("nij,nkj->nki", R, parts).reshape(-1, 6)
+    rows = np.column_stack([time, angles, turned])
+    path = cell / "ground.csv"
+    np.savetxt(path, rows, delimiter=",", header=HEADER, comments="")
+    (cell / "g.toml").write_text(FILE + "in_ground = true\n")
+    found = []
+    for file, log in (("e.toml", "short.csv"), ("g.toml", "ground.csv")):
+        experiment = jid.experiment.load_experiment(cell / file)
+        report = jid.workflow.identify_payload_from_logs(
+            experiment.setup,
+            [],
+            [cell / log],
+            experiment.columns,
+            sensor=experiment.sensor,
+        )
+        assert not report.findings
+        found.append(report.result.parameters)
+    np.testing.assert_allclose(*found, rtol=1e-6, atol=1e-8)
 
 
 def test_a_bias_that_drifts_is_named(cell):

@@ -1,15 +1,19 @@
 """Wrenches of force sensors as rows of virtual joints, and torques that are missing."""
 
+import dataclasses
+
 import numpy as np
 
 from jaxid.arrays import AnyArray, Numbers
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
+from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
+from jaxid.robot.virtual_joints import GROUP
 
 from .recording import Recording
-from .samples import MotionAndForces
+from .samples import MotionAndForces, joint_side
 
 
 def refuse_missing_wrench(recording: Recording, robot: Robot) -> None:
@@ -45,6 +49,30 @@ def on_all_joints(
 
     q, qd, qdd = (joined(x, zeros) for x in (motion.q, motion.qd, motion.qdd))
     return Motion(q, qd, qdd), joined(forces, wrench)
+
+
+def along_sensor_axes(recording: Recording, robot: Robot) -> Recording:
+    """Return a recording whose wrench was along the ground's axes, along the sensor's.
+
+    Args:
+        recording: Recording, whose moments are about the sensor's origin.
+        robot: Robot with the sensor at its end-effector.
+    """
+    angles, _, _ = joint_side(
+        robot, recording, recording.angles, None, np.zeros(recording.angles.shape)
+    )
+    q = np.zeros((len(angles), robot.joints))
+    q[:, list(robot.driven)] = angles
+    attitudes = sensor_attitudes(robot, q)
+    on_ground = np.asarray(recording.wrench).reshape(-1, 2, 3)
+    wrench = np.einsum("nji,nkj->nki", attitudes, on_ground)
+    return dataclasses.replace(recording, wrench=wrench.reshape(-1, GROUP))
+
+
+def sensor_attitudes(robot: Robot, q: np.ndarray) -> np.ndarray:
+    """Return the attitudes of the sensor at the end-effector on the ground."""
+    sensor = robot.replace(tip_body=robot.rigid[-1], tip_rotation=np.eye(3))
+    return tip_jacobian(sensor, q).rotation
 
 
 def measured_joints(robot: Robot, recording: Recording) -> np.ndarray:

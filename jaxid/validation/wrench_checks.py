@@ -13,9 +13,9 @@ from jaxid.arrays import Float, Matrix3
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import SensorLoad
+from jaxid.measurement.force_sensors import sensor_attitudes
 from jaxid.measurement.observations import Observations
 from jaxid.result_table import Remark, Status, significant
-from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.robot import Robot
 from jaxid.robot.virtual_joints import GROUP
 
@@ -74,20 +74,27 @@ def wrench_remarks(robot: Robot, observations: Observations) -> list[Remark]:
         for x in (motion, Motion(motion.q, rest, rest))
     )
     as_described = _gravity(forces, accelerations)
+    moments = observations.reduced_forces[:, list(robot.rigid[-GROUP:][3:])]
+    if _are_forces(moments, accelerations) and not _are_forces(forces, accelerations):
+        text = (
+            "forces and moments are exchanged: gravity acts on the last three columns "
+            "of `wrench` as on forces. Name the three forces first."
+        )
+        return [Remark(text, Status.BAD)]
     if _lacks_gravity(forces, at_rest, accelerations - at_rest):
         text = (
             "the wrench lacks the gravity of the load, which the controller or the "
             "driver takes out: set the load to zero there, and record again."
         )
         return [Remark(text, Status.BAD)]
-    sensor = robot.replace(tip_body=robot.rigid[-1], tip_rotation=np.eye(3))
-    attitudes = tip_jacobian(sensor, np.asarray(motion.q)).rotation
+    attitudes = sensor_attitudes(robot, np.asarray(motion.q))
     along_sensor = np.einsum("nji,nj->ni", attitudes, forces)
     in_ground = _gravity(along_sensor, accelerations)
     if in_ground.unexplained < LIMITS.improvement * as_described.unexplained:
         text = (
             "the wrench is along the axes of the ground, not of the sensor: gravity is "
-            "the same at all attitudes. Record the wrench in the sensor's frame."
+            "the same at all attitudes. Give `in_ground = true` in `[sensor]`, or "
+            "record the wrench in the sensor's frame."
         )
         return [Remark(text, Status.BAD)]
     return [*_axes_remarks(robot, as_described), *_taring(forces, as_described)]
@@ -102,6 +109,14 @@ def _gravity(forces: Forces, accelerations: Forces) -> _Gravity:
     spread = max(float(np.std(forces, axis=0) @ np.std(forces, axis=0)), 1e-300)
     unexplained = np.sqrt(np.mean(np.sum(errors**2, axis=1)) / spread)
     return _Gravity(solution[:3].T, solution[3], float(unexplained))
+
+
+def _are_forces(values: Forces, accelerations: Forces) -> bool:
+    """Return whether gravity acts alike along all axes, which it does on no moment."""
+    gravity = _gravity(values, accelerations)
+    gains = np.linalg.svd(gravity.gain, compute_uv=False)
+    is_explained = gravity.unexplained < LIMITS.max_unexplained
+    return bool(is_explained and gains[-1] > LIMITS.min_spread * gains[0])
 
 
 def _lacks_gravity(forces: Forces, gravity: Forces, inertia: Forces) -> bool:

@@ -17,6 +17,7 @@ from jaxid.identification.friction_laws import identify_transition_speeds
 from jaxid.identification.identify import identify
 from jaxid.identification.payload import Payload, identify_payload
 from jaxid.measurement.columns import Columns
+from jaxid.measurement.force_sensors import along_sensor_axes
 from jaxid.measurement.log_columns import Selection
 from jaxid.measurement.observations import Observations, observe
 from jaxid.result_table import Remark, Status
@@ -45,12 +46,14 @@ class ForceSensor:
         rotation: Roll, pitch and yaw of the sensor's frame in that of the end-effector
             [deg], like `[0.0, 0.0, 0.0]`.
         position: Origin of the sensor's frame there [m], like `[0.0, 0.0, 0.0]`.
+        in_ground: Whether the driver turns the wrench into the axes of the ground.
     """
 
     wrench: Selection
     sign: float = 1.0
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    in_ground: bool = False
 
     def __post_init__(self) -> None:
         """Refuse other signs.
@@ -81,6 +84,7 @@ def sensor_logs(
     base: BaseParameters,
     paths: Sequence[Path],
     columns: Columns,
+    sensor: ForceSensor,
     progress: Progress,
 ) -> tuple[list[Observations], list[Remark]]:
     """Return logs with a wrench, and what is wrong with them."""
@@ -90,6 +94,8 @@ def sensor_logs(
     for path in paths:
         progress(f"reading {path.name}", 0.0)
         recording = read_log(setup, path, columns)
+        if sensor.in_ground:
+            recording = along_sensor_axes(recording, robot)
         log = observe(recording, robot, setup.filter, setup.decimation, setup.min_speed)
         logs.append(log)
         remarks += [

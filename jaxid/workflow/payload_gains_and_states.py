@@ -219,7 +219,9 @@ def identify_payload_by_sensor(
     logs = {}
     remarks = []
     for name, paths in groups.items():
-        logs[name], findings = sensor_logs(setup, base, paths, columns, progress)
+        logs[name], findings = sensor_logs(
+            setup, base, paths, columns, sensor, progress
+        )
         # Without a load there is nothing that gravity could tell.
         remarks += findings if name == "loaded" else []
     payload, fit = payload_of_logs(

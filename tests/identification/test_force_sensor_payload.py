@@ -135,6 +135,8 @@ def test_a_wrench_that_is_not_the_one_described_is_named_by_gravity(time):
     parts = np.einsum("nij,nkj->nki", R, wrench(time, turn=0 * TURN).reshape(-1, 2, 3))
     (ground,) = findings(time, noisy(parts.reshape(-1, 6), 3))
     assert "axes of the ground" in ground.text
+    (exchanged,) = findings(time, noisy(np.roll(right, 3, axis=1), 6))
+    assert "forces and moments are exchanged" in exchanged.text
     weight = LOAD.mass * 9.81 * R[:, 2]
     moment = np.cross(LOAD.centre_of_mass, weight)
     inertial = wrench(time, turn=0 * TURN) - np.hstack([weight, moment])
