@@ -410,7 +410,7 @@ def _is_closed(closure: AnyArray, min_share: float = MIN_CLOSING_SHARE):
     return (closure[..., -2] <= max_gap**2) & (closure[..., -1] > min_share)
 
 
-def _is_quickly_closed(robot: Any, q: np.ndarray, closure: np.ndarray):
+def _is_quickly_closed(robot: Any, q: np.ndarray, closure: AnyArray):
     """Return whether quick steps surely close loops, and as precisely as others."""
     start = np.asarray(robot.loop_pose)[: robot.joints]
     is_near = np.abs(q - start).max(axis=-1) <= MAX_QUICK_WAY
