@@ -246,8 +246,7 @@ def _of_leaders(followers: Followers, parameters: dict[str, Any]) -> dict[str, A
     for key in ("armature", "damping", "friction", "stiffness"):
         parameters[key] = np.maximum(parameters[key], 0.0)
     ratios = linear_ratios(followers, joints).T
-    squares = ratios**2
-    sums = {key: squares @ values for key, values in parameters.items()}
+    sums = {key: ratios**2 @ values for key, values in parameters.items()}
     sums["friction"] = np.abs(ratios) @ parameters["friction"]
     # The springs of all joints are one spring, which rests where their forces cancel.
     positions = linear_coordinates(followers, np.zeros(joints))
@@ -411,13 +410,12 @@ def _follower_notes(tree: UrdfTree):
             f"{number} (`m{number}`); its friction is included in that of "
             f"`{leader_name}`."
         )
-    first_moved = first_number + len(led_followers)
     names = [x.name for x in tree.followers[len(led_followers) :]]
     if names:
+        first = first_number + len(led_followers)
         yield (
             f"{owners('joint', names)}: closed loops move what has no motor; the "
-            f"numbers of the bodies, such as `m{first_moved}`, are from {first_moved} "
-            f"to {len(tree.joints)} in this order."
+            f"bodies have the numbers {first} to {len(tree.joints)}, in this order."
         )
 
 
