@@ -143,9 +143,9 @@ def torque_report(
         sources: Logs.
         findings: Findings on the logs.
     """
-    rows = estimate_rows(fit.names, fit.units, fit.unknowns, fit.uncertainty)
-    kinds = [*fit.rollout.base.kinds, "delay"]
-    for row, kind, dof in zip(rows, kinds, fit.uncertainty.dof, strict=True):
+    run = fit.run
+    rows = estimate_rows(run.names, run.units, fit.unknowns, fit.uncertainty)
+    for row, kind, dof in zip(rows, run.kinds, fit.uncertainty.dof, strict=True):
         row.update(kind=kind, dof=float(dof))
     content = {"kind": "torques", "horizon": fit.horizon}
     return _report(robot, fit, errors, sources, findings, content, rows)

@@ -23,6 +23,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.terms import HardSign
 from jaxid.errors import InputError
 from jaxid.identification.identify import identify
+from jaxid.identification.run_to_run import Run
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.blocks import block_covariance
 from jaxid.least_squares import Minimum, search_squares
@@ -237,14 +238,18 @@ class TorqueRolloutFit(Summarised):
     converged: bool
 
     @property
-    def names(self) -> list[str]:
-        """Names of the unknowns."""
-        return [*self.rollout.base.names, "delay"]
-
-    @property
-    def units(self) -> list[str]:
-        """Units of the unknowns."""
-        return [*self.rollout.base.units, "s"]
+    def run(self) -> Run:
+        """Estimates, as `jid.agreement` takes them."""
+        base = self.rollout.base
+        return Run(
+            name=base.model.robot.name,
+            names=(*base.names, "delay"),
+            units=(*base.units, "s"),
+            kinds=(*base.kinds, "delay"),
+            parameters=self.unknowns,
+            covariance=self.uncertainty.covariance,
+            dof=float(np.median(self.uncertainty.dof)),
+        )
 
     @property
     def parameters(self) -> Vector:
@@ -315,8 +320,8 @@ class TorqueRolloutFit(Summarised):
         deviations = self.uncertainty.standard_deviations
         return Table(
             "open-loop rollouts",
-            Column("parameter", self.names),
-            *estimate_columns(self.unknowns, deviations, ends, self.units),
+            Column("parameter", self.run.names),
+            *estimate_columns(self.unknowns, deviations, ends, self.run.units),
         )
 
 

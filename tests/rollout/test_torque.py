@@ -56,6 +56,17 @@ def test_late_torques_are_found_and_the_simulation_is_closer(base, logs, fit):
     assert "delay" in str(found)
 
 
+def test_agreement_names_the_delay_of_one_run(fit):
+    run = fit.run
+    late = run.parameters.copy()
+    late[-1] += 0.01
+    runs = [run._replace(name=name) for name in ("first", "second")]
+    odd = run._replace(name="late", parameters=late)
+    result = jid.agreement([*runs, odd])
+    assert run.names[-1] == run.kinds[-1] == "delay"
+    assert result.odd_names == ("late",)
+
+
 def test_torques_that_determine_no_simulation_are_refused(base):
     log = driven_pendulum.log(0)
     # The torques of both joints are exchanged.
