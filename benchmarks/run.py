@@ -226,6 +226,11 @@ def check(scripts, whole):
             sys.executable,
             str(REPOSITORY / "notebooks/run_all.py"),
         ]
+        jobs["benchmarks/arms/run.py --quick"] = [
+            sys.executable,
+            str(REPOSITORY / "benchmarks/arms/run.py"),
+            "--quick",
+        ]
         jobs["docs/build.py"] = [sys.executable, str(REPOSITORY / "docs/build.py")]
         settings = ("JAXID_CHECK_SHAPES=1", "JAX_DISABLE_MOST_OPTIMIZATIONS=0")
         jobs["tests with checked shapes, optimised"] = [

@@ -114,6 +114,8 @@ print(f"mean error {before.mean():.2f} mm -> {after.mean():.3f} mm")
 #
 # The guide: [kinematic calibration](../docs/calibration.md), with balls in sockets, cameras and planes, and which poses to record next.
 #
+# Next: [which method, on which robot](14_table.ipynb).
+#
 # ## Exercise
 #
 # Calibrate with the first two sessions only. Why do the intervals become so wide?

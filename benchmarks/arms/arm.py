@@ -35,8 +35,7 @@ class Arm(NamedTuple):
     unseen_text: str  # experiment file for the unseen logs
     unseen_logs: Sequence[Path]
     folder: Path  # folder to which paths in the experiment files are relative
-    # For simulated robots: forces of the machine [N m or N] at a motion.
-    truth: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray] | None = None
+    machine: Any = None  # the simulated machine, if its parameters are the truth
 
     def experiment(self, unseen: bool = False) -> Any:
         """Return the experiment of the logs, or of the unseen ones."""
@@ -76,3 +75,49 @@ class Result(NamedTuple):
     forces: Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
     # Ten parameters of each body (m, m c, A, B, C, D, E, F), if there are any.
     bodies: np.ndarray | None = None
+
+
+class ServoArm(NamedTuple):
+    """Robot of position-controlled joints: commands and positions, no torques."""
+
+    name: str
+    logs: list[Any]  # recordings to identify from; their `forces` are the commands
+    unseen_logs: list[Any]
+    bodies: Any  # `jaxid.rollout.Bodies` of the robot's file
+    joints: tuple[int, ...]  # joints that are judged
+    stiffness: float | None = None  # known gain of the servos [N m/rad]
+
+
+class ServoResult(NamedTuple):
+    """What a method for servo joints returns."""
+
+    # Positions [samples, joints] of some recordings, each simulated from its first
+    # position under its commands.
+    positions: Callable[[list[Any]], list[np.ndarray]]
+
+
+class Session(NamedTuple):
+    """Poses of one session of a calibration; a place is one socket, or one board."""
+
+    name: str
+    poses: dict[str, np.ndarray]  # joint coordinates [poses, joints] of each place
+    # Measured rotations and positions of each place; none if a ball stays in a socket.
+    measured: dict[str, tuple[np.ndarray, np.ndarray]]
+
+
+class GeometryArm(NamedTuple):
+    """Robot whose nominal geometry is known, and sessions of poses to calibrate it."""
+
+    name: str
+    robot: Any  # `jaxid.Robot` of nominal geometry
+    masses: tuple[float, ...]  # rough masses of the bodies [kg]
+    sessions: list[Session]
+    distance: float | None  # known distance of the two sockets [m]
+
+
+class GeometryResult(NamedTuple):
+    """What a method for geometry returns."""
+
+    # Rotation [poses, 3, 3] and position [poses, 3] of the tool, in the robot's base;
+    # of measured poses in the frame in which they are measured.
+    tips: Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]

@@ -1,4 +1,4 @@
-"""Figures of one method on one set: errors of torques and of simulations, bodies."""
+"""Figures of one method on logs with torques: errors of torques and simulations."""
 
 import numpy as np
 
@@ -6,6 +6,12 @@ HORIZONS = (0.1, 0.5)
 """Durations of simulations under measured torques [s]."""
 STARTS = 40
 """Number of states from which simulations start."""
+STEP = 0.002
+"""Step of simulations [s]."""
+MAX_SPEED = 1e3
+"""Speed from which a simulation diverges [rad/s or m/s]."""
+SPEED_STEP = 1e-3
+"""Step of speeds for the change of friction with the speed [rad/s or m/s]."""
 POSES = 200
 """Number of recorded poses in which the mass matrix is looked at."""
 MAX_SAMPLES = 20_000
@@ -27,59 +33,75 @@ def torque_errors(result, logs):
     return total, np.sqrt(squares / force_squares)
 
 
-def mass_matrices(result, q):
-    """Return the mass matrix at some poses, from differences of forces at rest."""
-    zeros = np.zeros_like(q)
-    rest = result.forces(q, zeros, zeros)
+def slopes(function, x, step):
+    """Return the derivatives of forces by each element of motion, by differences."""
+    start = function(x)
     columns = []
-    for joint in range(q.shape[1]):
-        unit = zeros.copy()
-        unit[:, joint] = 1.0
-        columns.append(result.forces(q, zeros, unit) - rest)
+    for joint in range(x.shape[1]):
+        moved = x.copy()
+        moved[:, joint] += step
+        columns.append((function(moved) - start) / step)
     return np.stack(columns, axis=-1)
+
+
+def mass_matrices(result, q, qd):
+    """Return the mass matrix at some states."""
+    return slopes(lambda qdd: result.forces(q, qd, qdd), np.zeros_like(q), 1.0)
 
 
 def definite_share(result, logs):
     """Return the share of recorded poses with a positive definite mass matrix."""
     q = np.concatenate([log.q for log in logs])
     q = q[:: max(1, len(q) // POSES)]
-    matrices = mass_matrices(result, q)
+    matrices = mass_matrices(result, q, np.zeros_like(q))
     symmetric = 0.5 * (matrices + np.swapaxes(matrices, 1, 2))
     return float(np.mean(np.linalg.eigvalsh(symmetric)[:, 0] > 0))
 
 
-def accelerations(result, q, qd, forces):
-    """Return the accelerations under some forces."""
-    bias = result.forces(q, qd, np.zeros_like(q))
-    return np.linalg.solve(mass_matrices(result, q), (forces - bias)[..., None])[..., 0]
+def next_speeds(result, q, qd, forces, duration):
+    """Return the speeds after a short step under some forces.
+
+    Dry friction is stiff, so that its change with the speed counts at the end of the
+    step (linearly implicit Euler).
+    """
+    still = np.zeros_like(q)
+    bias = result.forces(q, qd, still)
+    damping = slopes(lambda x: result.forces(q, x, still), qd, SPEED_STEP)
+    matrix = mass_matrices(result, q, qd) + duration * damping
+    acceleration = np.linalg.solve(matrix, (forces - bias)[..., None])[..., 0]
+    return qd + duration * acceleration
 
 
-def simulation_errors(result, logs, horizon):
-    """Return the RMS error of positions at the end of simulations [rad or m].
+def simulation_errors(result, logs):
+    """Return the RMS error of positions after each horizon of simulations [rad or m].
 
-    Each begins at a recorded state and follows the recorded torques (midpoint rule).
+    Each begins at a recorded state and follows the recorded torques.
     """
     log = max(logs, key=lambda x: len(x.q))
-    step = log.sample_time
-    stride = max(1, round(0.002 / step))
-    count = int(horizon / (stride * step))
-    last = len(log.q) - count * stride - 1
+    time = log.sample_time * np.arange(len(log.q))
+    last = len(log.q) - int(HORIZONS[-1] / log.sample_time) - 2
     starts = np.linspace(0, last, STARTS).astype(int)
     q = log.q[starts].copy()
     qd = log.qd[starts].copy()
-    duration = stride * step
-    for k in range(count):
-        now = starts + k * stride
-        forces = 0.5 * (log.forces[now] + log.forces[now + stride])
-        start_acceleration = accelerations(result, q, qd, log.forces[now])
-        middle_q = q + 0.5 * duration * qd
-        middle_qd = qd + 0.5 * duration * start_acceleration
-        acceleration = accelerations(result, middle_q, middle_qd, forces)
-        q = q + duration * middle_qd
-        qd = qd + duration * acceleration
-    errors = q - log.q[starts + count * stride]
-    rms = float(np.sqrt(np.mean(errors**2)))
-    return rms if np.isfinite(rms) else np.inf
+    ends = [round(x / STEP) for x in HORIZONS]
+    errors = []
+    for k in range(1, ends[-1] + 1):
+        forces = at_times(time[starts] + (k - 0.5) * STEP, time, log.forces)
+        # Forces that depend on the position count in the middle of the step.
+        end_speeds = next_speeds(result, q + 0.5 * STEP * qd, qd, forces, STEP)
+        q = q + 0.5 * STEP * (qd + end_speeds)
+        qd = end_speeds
+        if not np.all(np.abs(qd) < MAX_SPEED):
+            break
+        if k in ends:
+            distances = q - at_times(time[starts] + k * STEP, time, log.q)
+            errors.append(float(np.sqrt(np.mean(distances**2))))
+    return errors + [np.inf] * (len(ends) - len(errors))
+
+
+def at_times(times, samples, values):
+    """Return recorded values [times, joints], interpolated between samples."""
+    return np.stack([np.interp(times, samples, x) for x in values.T], axis=-1)
 
 
 def plausible_share(bodies):
@@ -96,3 +118,18 @@ def plausible_share(bodies):
         size = np.abs(np.diag(pseudo_inertia)).max()
         shares.append(np.linalg.eigvalsh(pseudo_inertia)[0] >= -1e-9 * size)
     return float(np.mean(shares))
+
+
+def figures(arm, method):
+    """Return all figures by name."""
+    result = method(arm)
+    unseen = arm.signals(unseen=True)
+    total, joints = torque_errors(result, unseen)
+    return {
+        "error": total,
+        "worst": float(joints.max()),
+        "joints": joints.tolist(),
+        "simulations": simulation_errors(result, unseen),
+        "definite": definite_share(result, unseen),
+        "plausible": plausible_share(result.bodies),
+    }

@@ -42,4 +42,5 @@ def conic(arm):
     return Result(lambda *motion: columns(*motion) @ estimates, bodies)
 
 
+KIND = "torques"
 METHODS = {"CVXPY and CLARABEL": conic}

@@ -42,4 +42,5 @@ def figaroh(arm):
     return Result(lambda *motion: columns(*motion)[..., chosen] @ estimates)
 
 
+KIND = "torques"
 METHODS = {"FIGAROH": figaroh}

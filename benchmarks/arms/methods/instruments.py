@@ -37,4 +37,5 @@ def instruments(arm):
     return Result(lambda *motion: columns(*motion)[..., chosen] @ estimates)
 
 
+KIND = "torques"
 METHODS = {"instrumental variables": instruments}

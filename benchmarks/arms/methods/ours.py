@@ -58,6 +58,7 @@ def weighted(arm):
     return _with_estimator(arm, jid.WeightedLeastSquares())
 
 
+KIND = "torques"
 METHODS = {
     "jaxid": default,
     "jaxid choose": choice,

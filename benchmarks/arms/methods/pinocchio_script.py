@@ -65,4 +65,5 @@ def script(arm):
     return Result(lambda *motion: columns(*motion)[..., chosen] @ estimates)
 
 
+KIND = "torques"
 METHODS = {"NumPy and Pinocchio": script}

@@ -29,7 +29,9 @@ def machine_and_logs(name, folder, machine_name, kind, change=None):
         (folder / "machine.xml").write_text(text, encoding="utf-8")
         for seed, path in enumerate(logs):
             write_log(path, record(truth, KINDS[kind], seed))
-    return Arm(name, BAND, LOG, logs[:1], LOG, logs[1:], folder)
+    # With another geometry, there are no true parameters.
+    known = truth if name != "wrong_geometry" else None
+    return Arm(name, BAND, LOG, logs[:1], LOG, logs[1:], folder, known)
 
 
 def write_log(path, log):
@@ -92,7 +94,7 @@ def elastic(folder):
         (folder / "machine.xml").write_text(truth.file, encoding="utf-8")
         for seed, path in enumerate(logs):
             write_log(path, record_with_springs(truth, seed))
-    return Arm("elastic", BAND, LOG, logs[:1], LOG, logs[1:], folder)
+    return Arm("elastic", BAND, LOG, logs[:1], LOG, logs[1:], folder, truth)
 
 
 def record_with_springs(truth, seed):
@@ -150,6 +152,7 @@ def record_with_springs(truth, seed):
     return Log(time[::STEPS][:samples], seen, forces, q_ref[::STEPS][:samples])
 
 
+KIND = "torques"
 SETS = {
     "closed_loop": closed_loop,
     "elastic": elastic,
