@@ -50,13 +50,13 @@ def copied_command(arm):
 
 def motions(arm, logs):
     """Return time, positions, commands and weight torques of each part of logs."""
-    from jaxid import Motion
+    import jaxid as jid
 
     parts = []
     for log in logs:
         for start, stop in log.segments:
             q = np.asarray(log.angles)[start:stop]
-            still = Motion(q, np.zeros_like(q), np.zeros_like(q))
+            still = jid.Motion(q, np.zeros_like(q), np.zeros_like(q))
             bodies = arm.bodies
             weights = bodies.model.inverse_dynamics(bodies.parameters, still)
             time = log.sample_time * np.arange(len(q))
