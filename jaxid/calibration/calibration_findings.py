@@ -53,9 +53,10 @@ def _verdict(fit: "GeometryFit", findings: list[Remark]) -> Remark:
     worst = findings[0].status if findings else Status.GOOD
     if not fit.can_hold_out:
         sentence = (
-            "The geometry was not checked on sessions that it has not seen, for which "
-            "at least three are needed: record more, or divide the poses (`parts` in "
-            "the experiment file)"
+            "The geometry was not checked on sessions that it has not seen: this takes "
+            f"three, but there are {len(fit.problem.sessions)}. Record more; or, if "
+            "each file is a session, name the files instead of their folder; or divide "
+            "the poses (`parts` in the experiment file)"
         )
         return Remark(sentence, worst if worst is Status.BAD else Status.DOUBTFUL)
     before = 1e3 * fit.mean_error(fit.held_out.nominal)

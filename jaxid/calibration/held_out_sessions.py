@@ -39,7 +39,9 @@ def held_out_errors(problem: CalibrationProblem, has_compliance: bool) -> HeldOu
         rows = poses.session == session
         calibrated[rows] = solution.adjustment.linearisation.errors[rows]
         nominal[rows] = nominal_solution_errors(problem, solution.weights)[rows]
-    rows = ~poses.is_pose
+    # Places that all sessions share keep their distance in every fit.
+    is_shared = np.array([not owner for owner, _ in problem.frame_keys])
+    rows = ~poses.is_pose & ~is_shared[poses.place]
     distances = calibrated[rows, 0] * poses.deviations[rows, 0]
     return HeldOutErrors(
         problem.error_sizes(calibrated), problem.error_sizes(nominal), distances

@@ -54,7 +54,7 @@ def require_right_robot(
         return
     errors = {}
     for words, correct in _corrections(robot):
-        others = [correct(x) if x.has_poses else x for x in observations]
+        others = [correct(x) for x in observations]
         errors[words] = typical_nominal_error(build_problem(robot, others, None))
     words = min(errors, key=lambda words: errors[words])
     is_explained = errors[words] < LIMITS.left_by_mistake * error
@@ -93,13 +93,17 @@ def _corrections(robot: Robot) -> Iterator[tuple[str, Callable]]:
     yield "with the joints in the reverse order", backwards
     degrees = np.diag(np.where(robot.revolute, np.rad2deg(1.0), 1.0))
     yield "with joint angles 57.3 times as large", partial(_with_joints, degrees)
-    yield "with measured lengths 1,000 times smaller", partial(_with_lengths, 1e-3)
-    yield "with measured lengths 1,000 times larger", partial(_with_lengths, 1e3)
+    for factor, change, unit in ((1e-3, "smaller", "mm"), (1e3, "larger", "m")):
+        cure = f'(`length_unit = "{unit}"` in the experiment file)'
+        words = f"with known and measured lengths 1,000 times {change} {cure}"
+        yield words, partial(_with_lengths, factor)
     yield "with each measured pose the other way round (`eye_in_hand`)", _inverted
 
 
 def _with_joints(matrix: np.ndarray, observation: AbstractObservation):
     """Return an observation whose joint coordinates are multiplied by a matrix."""
+    if not observation.has_poses:
+        return observation
     return dataclasses.replace(observation, q=observation.q @ matrix)
 
 

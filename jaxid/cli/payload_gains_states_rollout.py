@@ -183,9 +183,10 @@ def calibrate(
     table of poses to record next.
     """
     paths = log or []
-    console = options.start(
-        *sessions, *paths, experiment=experiment, output=output, force=force
-    )
+    # Files of poses have columns of their own.
+    options.require_paths(sessions)
+    options.require_experiment_first(experiment, sessions)
+    console = options.start(*paths, experiment=experiment, output=output, force=force)
     content = jid.experiment.load_experiment(experiment)
     logs = None
     if paths:

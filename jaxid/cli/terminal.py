@@ -31,6 +31,8 @@ takes 83 to 97 % of the time left, the rounds of `choose` 89 %, other stages mos
 """
 SHORT_PART = 0.07
 """Part of the time left that another stage takes."""
+MIN_SHARE = 0.1
+"""Share of the work below which nothing is said of the time left."""
 Progress = Callable[[str, float], None]
 """Function that shows the completed fraction (0 to 1) of a stage."""
 
@@ -166,8 +168,10 @@ def _print_lines(console: Console, task: Any, end: threading.Event) -> None:
     while not end.wait(LINE_INTERVAL):
         share = task.completed
         elapsed_time = time.monotonic() - start_time
-        time_left = elapsed_time * (1.0 / max(share, 0.02) - 1.0)
-        words = f"{task.description}: {100 * share:.0f} %, about {time_left:.0f} s left"
+        words = f"{task.description}: {100 * share:.0f} %"
+        if share > MIN_SHARE:
+            time_left = elapsed_time * (1.0 / share - 1.0)
+            words += f", about {time_left:.0f} s left"
         console.print(Text(words))
 
 

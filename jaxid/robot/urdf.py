@@ -372,9 +372,9 @@ def _mount_notes(tree: UrdfTree, base: str | None):
     angle = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
     vector = ", ".join(f"{x:.4g}" for x in g)
     return [
-        f"link `{base}` is tilted by {angle:.3g} degrees by {joints} above it (moving "
-        f"joints are held near zero): gravity in its frame is [{vector}] m/s²; if the "
-        "link is mounted differently, give `gravity` or `base_rotation`."
+        f"link `{base}` is carried by {joints} at a tilt of {angle:.3g} degrees "
+        f"(moving joints are held near zero): gravity in its frame is [{vector}] m/s²; "
+        "if the link is mounted differently, give `gravity` or `base_rotation`."
     ]
 
 

@@ -192,8 +192,9 @@ def _common_force_findings(robot: Robot, statistics: LogStatistics) -> list[str]
     ratios = statistics.force / robot.known_max_forces
     ratios = ratios[np.isfinite(robot.known_max_forces)]
     cure = (
-        "check `recording.force_unit`, `torque_constants`, and `forces_side` with "
-        "`drives.gear_ratios`."
+        "check `recording.force_unit`, `torque_constants`, `forces_side` with "
+        "`drives.gear_ratios`, and whether `limits.force` or the limits of the robot's "
+        "file are real."
     )
     if ratios.size < 2:
         return []

@@ -229,6 +229,9 @@ def read_observations(
     kinds = {**OBSERVATIONS, "eye_in_hand": MeasuredPose.eye_in_hand}
     observations: list[Any] = []
     places: dict[str, list[str]] = {}
+    is_divided = settings.parts > 1
+    if is_divided:
+        _require_one_session(files)
     for file in files:
         try:
             arrays = _read(setup.robot, file.path, settings)
@@ -240,7 +243,6 @@ def read_observations(
         poses = len(arrays["q"])
         order = np.random.default_rng(0).permutation(poses)
         for number, rows in enumerate(np.array_split(order, settings.parts), 1):
-            is_divided = settings.parts > 1
             observations.append(
                 kinds[settings.observation](
                     f"part {number}" if is_divided else file.session,
@@ -257,15 +259,30 @@ def read_observations(
                 "`calibration.distance` is that of two places in each session, but "
                 f"session `{session}` has {len(names)}: leave it out."
             )
-        observations.append(
+        owners = [f"part {k + 1}" for k in range(settings.parts)]
+        # Each part holds the distance, and all parts together count as one.
+        observations += [
             SocketDistance(
-                session,
+                owner,
                 distance=settings.metres * settings.distance,
                 place=names[0],
                 other_place=names[1],
+                place_stays=is_divided,
+                deviation=SocketDistance.deviation * settings.parts**0.5,
             )
-        )
+            for owner in (owners if is_divided else [session])
+        ]
     return observations
+
+
+def _require_one_session(files: list[SessionFile]) -> None:
+    """Reject several sessions, whose places parts would take for the same."""
+    count = len({file.session for file in files})
+    if count > 1:
+        raise InputError(
+            "`calibration.parts` divides the poses of one session, but there are "
+            f"{count} sessions: leave it out."
+        )
 
 
 def _read(

@@ -180,6 +180,7 @@ def test_a_written_mjcf_is_the_calibrated_robot(tmp_path, joints_of_bodies):
         ('observation = "ball"', "calibration.observation"),
         ("masses = [1.0, 2.0]", "masses"),
         ("parts = 0", "calibration.parts"),
+        ("parts = 3", "calibration.parts"),
     ],
 )
 def test_wrong_experiments_are_refused(folder, line, name):
@@ -193,6 +194,44 @@ def test_wrong_experiments_are_refused(folder, line, name):
     message = result.output or str(result.exception)
     assert f"`{name}`" in message
     assert not output.exists()
+
+
+def test_files_are_sessions_of_columns_that_no_log_has(folder):
+    text = (folder / "experiment.toml").read_text()
+    path = folder / "with log.toml"
+    path.write_text(text + '[recording]\nangles = "a{}"\nforces = "tau{}"\n')
+    files = []
+    for session in range(3):
+        files.append(folder / f"day {session}.csv")
+        shutil.copy(folder / "sessions" / f"day {session}" / "tracker.csv", files[-1])
+    result = run("calibrate", path, *files, "-o", folder / "from files")
+    assert result.exit_code == 0, result.output
+    assert "On sessions held out in turn" in " ".join(result.output.split())
+
+
+def test_parts_share_the_distance_of_two_places(folder):
+    """The distance counts in each fit, so that it is not judged as if held out."""
+    robot = jid.load_urdf(folder / "arm.urdf")
+    arm = TrueArm(robot, true_origins(robot), masses=np.array(MASSES))
+    tool = np.array([0.0, 0.1, 0.2])
+    session = folder / "plate"
+    session.mkdir()
+    middle = arm.placement(np.array([0.3, 0.8, 0.5, 0.9]), tool)[1]
+    for place, x in (("left", -0.025), ("right", 0.025)):
+        points = np.tile(middle + np.array([x, 0.0, 0.0]), (40, 1))
+        q = arm.touching(random_poses(robot, 40, 1), tool, points)
+        is_reached = np.linalg.norm(arm.placements(q, tool)[1] - points, axis=1) < 1e-6
+        q = q[is_reached & (np.abs(q) < 2.0).all(axis=1)]
+        np.savetxt(session / f"{place}.csv", q[:12], delimiter=",")
+    path = folder / "parts.toml"
+    path.write_text(
+        '[robot]\nurdf = "arm.urdf"\n[calibration]\nparts = 3\ndistance = 0.05\n'
+    )
+    result = run("calibrate", path, session, "-o", folder / "parts")
+    assert result.exit_code == 0, result.output
+    words = " ".join(result.output.split())
+    assert "On sessions held out in turn" in words
+    assert "Known distances" not in words
 
 
 def test_better_geometry_explains_torques_better(folder):

@@ -186,7 +186,7 @@ def other_way_round(x):
     [
         ("point_contact", with_sign, "the other sign of `joint4`"),
         ("plane_contact", swapped, "`joint2` and `joint3` swapped"),
-        ("measured_position", in_millimetres, "1,000 times smaller"),
+        ("measured_position", in_millimetres, "1,000 times smaller .`length_unit"),
         ("measured_pose", other_way_round, "`eye_in_hand`"),
         ("measured_position", lambda x: dataclasses.replace(x, q=x.q[::-1]), "zeros"),
     ],

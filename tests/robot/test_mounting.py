@@ -64,10 +64,14 @@ def test_a_tool_at_the_end_effector_weighs_where_the_end_effector_is():
 
 BODY = inertial(3.0, (0.1, 0.05, 0.2), (0.1, 0, 0), (0.1, 0.01, 0, 0.12, 0, 0.08))
 MOUNTS = {
-    "ceiling": ("3.141592653589793 0 0", "0 0 0", "180 degrees by joint `to_torso`"),
-    "rounded ceiling": ("3.14159 0 0", "0 0 0", "180 degrees by joint `to_torso`"),
-    "wall": ("0 0 0", "0 1.5707963267948966 0", "90 degrees by joint `to_base`"),
-    "two joints": ("1 0 0", "0 0.5 0", "61.7 degrees by joints `to_torso`, `to_base`"),
+    "ceiling": ("3.141592653589793 0 0", "0 0 0", "joint `to_torso` at a tilt of 180"),
+    "rounded ceiling": ("3.14159 0 0", "0 0 0", "joint `to_torso` at a tilt of 180"),
+    "wall": ("0 0 0", "0 1.5707963267948966 0", "joint `to_base` at a tilt of 90"),
+    "two joints": (
+        "1 0 0",
+        "0 0.5 0",
+        "joints `to_torso`, `to_base` at a tilt of 61.7",
+    ),
 }
 LIMIT = '<limit lower="-2" upper="2" velocity="3" effort="9"/>'
 
@@ -112,7 +116,7 @@ def test_fixed_joints_above_the_base_turn_gravity_as_in_pinocchio(
         for row in zip(motion.q, motion.qd, motion.qdd, strict=True)
     ]
     np.testing.assert_allclose(forces(path, robot, motion), expected, atol=1e-11)
-    assert f"`base` is tilted by {tilt} above it" in robot.notes[0]
+    assert f"`base` is carried by {tilt} degrees " in robot.notes[0]
     # The frames are those of the base, and gravity that a user states is as stated.
     assert robot.offset[0].tolist() == [0.0, 0.0, 0.0]
     upright = load_urdf(path, base="base", base_rotation=np.eye(3))
@@ -144,7 +148,7 @@ def test_a_moving_joint_above_the_base_is_named(tmp_path):
     path = tmp_path / "arm.urdf"
     path.write_text(arm_on_mount(kind="revolute"))
     (note,) = load_urdf(path, base="base").notes
-    assert "by joint `to_base` above it" in note
+    assert "is carried by joint `to_base` at" in note
     path.write_text(arm_on_mount(second="3.141592653589793 0 0", kind="floating"))
     assert load_urdf(path, base="base").gravity.tolist() == [0.0, 0.0, 9.81]
 
@@ -173,4 +177,4 @@ def test_bodies_above_the_base_turn_gravity_as_in_mujoco(tmp_path):
         mujoco.mj_inverse(model, data)
         expected.append(data.qfrc_inverse.copy())
     np.testing.assert_allclose(forces(path, robot, motion), expected, atol=1e-10)
-    assert "joints `torso mount`, `base mount` above it" in robot.notes[0]
+    assert "joints `torso mount`, `base mount` at a tilt of 147" in robot.notes[0]
