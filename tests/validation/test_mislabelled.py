@@ -399,7 +399,7 @@ def test_forces_in_another_unit_are_one_doubt_and_not_four(motors, factor, words
     assert len(doubts) == 1
     assert doubts[0].startswith(words)
     assert (
-        "check `recording.force_unit`, `torque_constants`, and `forces_side` with "
+        "check `recording.force_unit`, `torque_constants`, `forces_side` with "
         in doubts[0]
     )
 
