@@ -29,7 +29,7 @@ from jaxid.robot.virtual_joints import driven_robot
 from .clipped_forces import clipped_forces, limited_forces
 from .clock import clock_finding, held_forces
 from .limit_checks import LogStatistics, limit_findings
-from .mistake_search import find_mistakes
+from .mistake_search import find_mistakes, ignore_progress
 from .sensor_checks import channel_findings, constant_forces
 
 MAX_SAMPLES = 2**17
@@ -297,13 +297,16 @@ class LogMistakes(NamedTuple):
 
 
 def mistakes_in_logs(
-    diagnoses: Sequence[Diagnosis], fit: Fit, bodies: np.ndarray | None = None
+    diagnoses: Sequence[Diagnosis],
+    fit: Fit,
+    bodies: np.ndarray | None = None,
+    progress: Progress = ignore_progress,
 ) -> LogMistakes:
     """Return findings of a fit to several logs, which are judged together.
 
     The inertial parameters of the robot's file are in `bodies`, if it states some.
     """
-    mistakes = _mistakes(diagnoses, fit, bodies)
+    mistakes = _mistakes(diagnoses, fit, bodies, progress)
     if len(diagnoses) > 1:
         return mistakes
 
@@ -320,7 +323,10 @@ def mistakes_in_logs(
 
 
 def _mistakes(
-    diagnoses: Sequence[Diagnosis], fit: Fit, bodies: np.ndarray | None
+    diagnoses: Sequence[Diagnosis],
+    fit: Fit,
+    bodies: np.ndarray | None,
+    progress: Progress = ignore_progress,
 ) -> LogMistakes:
     """Return the mistake that explains most, and what only a model reveals."""
     model = fit.base.model
@@ -351,7 +357,7 @@ def _mistakes(
         return LogMistakes()
     if len(commands) < len(recordings):
         commands = []
-    mistakes = find_mistakes(model, recordings, bodies, commands)
+    mistakes = find_mistakes(model, recordings, bodies, commands, progress)
     certain = mistakes.explained or mistakes.unexplained
     doubts = (*mistakes.possible, *mistakes.doubts, *doubts)
     logs = [x.observations for x in diagnoses if x.observations is not None]

@@ -1,12 +1,14 @@
 """Search for the mistake that explains most of what a model misses."""
 
 from collections.abc import Iterable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from jaxid.dynamics.model import Model
 from jaxid.identification.delay import Delay
+from jaxid.measurement.observations import Progress
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import significant
 
@@ -100,6 +102,20 @@ EXCHANGED_COMMANDS = (
 )
 
 
+class SearchParts(NamedTuple):
+    """Fractions of the time of a search at which its parts end, as on the UR10."""
+
+    suspects: float = 0.4
+    quantities: float = 0.85
+
+
+PARTS = SearchParts()
+
+
+def ignore_progress(fraction: float) -> None:
+    """Tell nobody."""
+
+
 class Mistakes(NamedTuple):
     """Findings of a search, as sentences.
 
@@ -164,6 +180,7 @@ def find_mistakes(
     recordings: Sequence[Recording],
     bodies: np.ndarray | None = None,
     commands: Sequence[Recording] = (),
+    progress: Progress = ignore_progress,
 ) -> Mistakes:
     """Look for the mistake in logs or robot that explains most.
 
@@ -175,6 +192,7 @@ def find_mistakes(
         recordings: Logs, whose columns are taken alike.
         bodies: Inertial parameters of the robot's file [bodies, 10]; or None.
         commands: The same logs with the commanded angles as angles, if they are known.
+        progress: Callback, called with the completed fraction (0 to 1) of a search.
     """
     log = FilteredLog(model.robot, recordings)
     if not log.is_long_enough:
@@ -187,15 +205,15 @@ def find_mistakes(
         return Mistakes(explained=tuple(missing_forces))
     delay = common_delay(described_log)
     rest = rest_remarks(described_log)
-    mistakes = _mistakes_of_all(described_log, recordings, bodies)
+    mistakes = _mistakes_of_all(described_log, recordings, bodies, progress)
     if log.friction_shares.max() > MAX_FRICTION_SHARE and not mistakes.explained:
         # Friction by load may hide mistakes, or stand for effects that are missing.
         described_log = DescribedLog(model, log, is_strict=True)
-        strict_mistakes = _mistakes_of_all(described_log, recordings, bodies)
+        strict_mistakes = _mistakes_of_all(described_log, recordings, bodies, progress)
         if strict_mistakes.explained:
             mistakes = strict_mistakes
     if not mistakes.explained and len(recordings) > 1:
-        mistakes = _mistakes_by_log(model, recordings, mistakes)
+        mistakes = _mistakes_by_log(model, recordings, mistakes, progress)
     if not mistakes.explained and bodies is not None:
         mistakes = _with_witness(mistakes, described_log, bodies)
     if not mistakes.explained:
@@ -207,23 +225,27 @@ def _mistakes_of_all(
     described_log: DescribedLog,
     recordings: Sequence[Recording],
     bodies: np.ndarray | None,
+    progress: Progress,
 ) -> Mistakes:
     """Look for the mistake in all logs together."""
     suspected = SuspectedMistakes(described_log, recordings[0], bodies)
     suspects = [*suspected.of_columns(), *suspected.of_robot()]
     is_one_log = len(recordings) == 1
-    return _search(described_log, suspected, suspects, is_one_log)
+    return _search(described_log, suspected, suspects, is_one_log, progress)
 
 
 def _mistakes_by_log(
-    model: Model, recordings: Sequence[Recording], mistakes: Mistakes
+    model: Model,
+    recordings: Sequence[Recording],
+    mistakes: Mistakes,
+    progress: Progress,
 ) -> Mistakes:
     """Return the mistakes of single logs in place of those of all together."""
     explained = []
     unexplained = []
     are_gains = []
     for recording in recordings:
-        log_mistakes = _mistakes_in_columns(model, recording)
+        log_mistakes = _mistakes_in_columns(model, recording, progress)
         are_gains += [log_mistakes.are_gains for _ in log_mistakes.explained]
         explained += [f"{recording.name}: {x}" for x in log_mistakes.explained]
         unexplained += [f"{recording.name}: {x}" for x in log_mistakes.unexplained]
@@ -249,7 +271,9 @@ def _with_witness(
     return mistakes
 
 
-def _mistakes_in_columns(model: Model, recording: Recording) -> Mistakes:
+def _mistakes_in_columns(
+    model: Model, recording: Recording, progress: Progress
+) -> Mistakes:
     """Look for the mistake in the columns of one of several logs."""
     log = FilteredLog(model.robot, [recording])
     if not log.is_long_enough:
@@ -257,7 +281,7 @@ def _mistakes_in_columns(model: Model, recording: Recording) -> Mistakes:
     described_log = DescribedLog(model, log)
     suspected = SuspectedMistakes(described_log, recording)
     suspects = [*suspected.of_columns()]
-    return _search(described_log, suspected, suspects, is_one_log=True)
+    return _search(described_log, suspected, suspects, True, progress)
 
 
 def _search(
@@ -265,6 +289,7 @@ def _search(
     suspected: SuspectedMistakes,
     suspects: Sequence[Suspect],
     is_one_log: bool,
+    progress: Progress,
 ) -> Mistakes:
     """Return what explains most: a mistake, in one log also a contact, or nothing."""
     judge = described_log.judge
@@ -273,7 +298,7 @@ def _search(
     odd = odd_joint(described_log) if misfit > MAX_CURED_MISFIT else None
     large_gains = _large_gains(described_log, suspected, odd)
     results = explanations(
-        described_log, [*suspects, *large_gains], suspected.quantities()
+        described_log, [*suspects, *large_gains], suspected.quantities(), progress
     )
     gain = results[0].gain if results else 0.0
     if is_one_log:
@@ -417,25 +442,29 @@ def _misfit_text(described_log: DescribedLog, fit: RowFit) -> str:
 
 def explanations(
     described_log: DescribedLog,
-    suspects: Iterable[Suspect],
+    suspects: Sequence[Suspect],
     quantities: Iterable[Quantity],
+    progress: Progress,
 ) -> list[Explanation]:
     """Return the mistakes that explain something, the best first."""
     judge = described_log.judge
     rows = described_log.rows
     score = judge.fit(rows).score
     trials = []
-    for suspect in suspects:
+    for number, suspect in enumerate(suspects):
+        progress(PARTS.suspects * number / len(suspects))
         suspect_rows = suspect.rows()
         gain = score - judge.fit(suspect_rows).score
         is_gain = suspect.is_gain
         trials.append(Trial(gain, suspect.sentence, suspect_rows, is_gain))
-    trials += searched_quantities(described_log, list(quantities))
+    progress_of_search = partial(_in_part, progress, PARTS.suspects, PARTS.quantities)
+    trials += searched_quantities(described_log, list(quantities), progress_of_search)
     trials.sort(key=lambda trial: -trial.gain)
 
     unseen_squares = judge.unseen_squares(rows)
     results = []
-    for trial in trials[:MAX_VALIDATED]:
+    for number, trial in enumerate(trials[:MAX_VALIDATED]):
+        _in_part(progress, PARTS.quantities, 1.0, number / MAX_VALIDATED)
         if trial.gain > SCREENED_PROMISE:
             trial_squares = judge.unseen_squares(trial.rows)
             unseen_gain = judge.score(unseen_squares) - judge.score(trial_squares)
@@ -451,3 +480,8 @@ def explanations(
             )
             results.append(explanation)
     return sorted(results, key=lambda result: -result.gain)
+
+
+def _in_part(progress: Progress, start: float, stop: float, fraction: float) -> None:
+    """Tell the fraction of a part of the search."""
+    progress(start + (stop - start) * fraction)

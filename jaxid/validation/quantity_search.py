@@ -6,6 +6,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import scipy
 
+from jaxid.measurement.observations import Progress
+
 from .descriptions import DescribedLog
 from .row_fits import RowFit, Rows, promise
 from .suspects import Quantity
@@ -26,7 +28,9 @@ class Trial(NamedTuple):
 
 
 def searched_quantities(
-    described_log: DescribedLog, quantities: Sequence[Quantity]
+    described_log: DescribedLog,
+    quantities: Sequence[Quantity],
+    progress: Progress,
 ) -> list[Trial]:
     """Return the best amounts of the most promising quantities."""
     judge = described_log.judge
@@ -38,7 +42,8 @@ def searched_quantities(
     promises = [_promise(described_log, quantity, fits) for quantity in quantities]
     order = np.argsort(promises)[::-1][:MAX_SEARCHED]
     trials = []
-    for k in order:
+    for number, k in enumerate(order):
+        progress(number / len(order))
         if promises[k] > SCREENED_PROMISE:
             quantity = quantities[k]
             amount = best_amount(described_log, quantity)

@@ -161,11 +161,14 @@ def identify_logs(
     )
     fit = setup.fit(rows)
 
-    progress("looking for mistakes", 0.0)
+    progress_of_search = partial(progress, "looking for mistakes")
+    progress_of_search(0.0)
     # Bounds would hide what is wrong.
     diagnoses = [log.diagnosis for log in fitted_logs]
     bodies = setup.file_bodies
-    mistakes = mistakes_in_logs(diagnoses, without_bounds(fit), bodies)
+    mistakes = mistakes_in_logs(
+        diagnoses, without_bounds(fit), bodies, progress_of_search
+    )
     if mistakes.delay is not None:
         fit = with_unknown_delay(fit, rows, mistakes.delay)
     validation = validate(

@@ -71,11 +71,18 @@ def test_one_joint_in_degrees_is_named(log):
     assert "the angle of joint `elbow`, and not of all, seems to be in deg" in sentence
 
 
-def test_several_wrong_signs_are_named_together(log):
+def test_several_wrong_signs_are_named_together_and_the_search_tells_how_far_it_is(log):
     angles, forces = log
     signs = np.array([-1.0, 1.0, -1.0, 1.0])
-    (sentence,) = mistakes(ARM_MODEL, angles, signs * forces).explained
+    recording = Recording.of(angles, signs * forces, sample_time=DT)
+    fractions = []
+    (sentence,) = find_mistakes(
+        ARM_MODEL, [recording], progress=fractions.append
+    ).explained
     assert "of the force of `base` and `elbow` (`recording.force_signs`)" in sentence
+    assert fractions == sorted(fractions)
+    assert fractions[0] == 0.0
+    assert fractions[-1] > 0.9
 
 
 def test_signs_of_angles_and_forces_are_found_together(log):
