@@ -30,7 +30,7 @@ from .clipped_forces import clipped_forces, limited_forces
 from .clock import clock_finding, held_forces
 from .limit_checks import LogStatistics, limit_findings
 from .mistake_search import find_mistakes, ignore_progress
-from .sensor_checks import channel_findings, constant_forces
+from .sensor_checks import channel_findings, constant_forces, repeated_channels
 
 MAX_SAMPLES = 2**17
 """Largest number of samples of a long log that are examined."""
@@ -180,6 +180,7 @@ def diagnose(
         *([clock_text] if clock_text else []),
         *limit_findings(robot, statistics, faulty_joints),
         *constant_forces(robot, excerpt),
+        *repeated_channels(robot, excerpt),
         *held_forces(robot, excerpt),
     ]
     limit_notes = [

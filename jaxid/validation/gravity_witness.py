@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.result_table import percent
+
 from .descriptions import DescribedLog
 from .filtered_log import Motion
 from .row_fits import RowFit
@@ -65,7 +67,7 @@ class GravityWitness(NamedTuple):
     @property
     def sentence(self) -> str:
         """Say how much differs, and the usual causes."""
-        difference = f"{100 * self.difference:.2g} %"
+        difference = f"{percent(self.difference)} %"
         text = f"gravity in the forces differs by {difference} from that of"
         if self.is_absent:
             text = f"the forces seem to lack gravity: {difference} differ from that of"

@@ -6,6 +6,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray
 from jaxid.dynamics.motion import Motion
+from jaxid.result_table import significant
 from jaxid.robot.robot import Robot
 
 from .torque_errors import REST_SHARE
@@ -202,8 +203,8 @@ def _common_force_findings(robot: Robot, statistics: LogStatistics) -> list[str]
     peak = ratios.max()
     if minimum > 1.2:
         text = (
-            f"all joints need more than their largest forces, {minimum:.2g} to "
-            f"{peak:.2g} times"
+            "all joints need more than their largest forces, "
+            f"{significant(minimum, 2)} to {significant(peak, 2)} times"
         )
         return [f"{text} as much: {cure}"]
     if 0 < peak < 0.02:

@@ -10,7 +10,7 @@ from jaxid.dynamics.model import Model
 from jaxid.identification.delay import Delay
 from jaxid.measurement.observations import Progress
 from jaxid.measurement.recording import Recording
-from jaxid.result_table import significant
+from jaxid.result_table import percent
 
 from .commands import are_exchanged
 from .common_delay import common_delay
@@ -19,11 +19,13 @@ from .descriptions import MAX_FRICTION_SHARE, DescribedLog
 from .filtered_log import FilteredLog
 from .gravity_witness import gravity_witness
 from .odd_joint import (
+    LIMITS as ODD_JOINT,
     OddJoint,
     log_gain,
     missing_force_texts,
     odd_joint,
     odd_joint_text,
+    other_cause_text,
 )
 from .quantity_search import (
     SCREENED_PROMISE,
@@ -266,7 +268,7 @@ def _with_witness(
     misfit = _misfit(fit, described_log.rows)
     if witness.is_absent and misfit < MAX_WITNESS_MISFIT:
         return mistakes._replace(explained=(witness.sentence,), possible=())
-    if witness.is_different:
+    if witness.is_different and not mistakes.unexplained:
         return mistakes._replace(doubts=(witness.sentence,))
     return mistakes
 
@@ -310,8 +312,10 @@ def _search(
     equal_results = _equal(results)
     texts = ", or ".join(x.sentence for x in equal_results)
     is_single = 0 < len(equal_results) <= MAX_EQUAL
-    if is_single and _is_cure(equal_results[0], misfit):
+    if is_single and _is_cure(equal_results[0], misfit, odd):
         effect = _effect_text(misfit, equal_results[0].misfit)
+        if odd is not None:
+            effect += other_cause_text(described_log, odd, texts)
         are_gains = all(x.is_gain for x in equal_results)
         return Mistakes(explained=(f"{texts}: {effect}",), are_gains=are_gains)
     if misfit > MAX_CURED_MISFIT:
@@ -365,8 +369,8 @@ def _signs_sentence(
 def _effect_text(misfit: float, remaining_misfit: float) -> str:
     """Return how much less of the forces a model misses without a mistake."""
     return (
-        f"the torque error is then {100 * remaining_misfit:.2g} % instead of "
-        f"{100 * misfit:.2g} %."
+        f"the torque error is then {percent(remaining_misfit)} % instead of "
+        f"{percent(misfit)} %."
     )
 
 
@@ -399,9 +403,14 @@ def _equal(results: Sequence[Explanation]) -> list[Explanation]:
     return list(by_sentence.values())
 
 
-def _is_cure(explanation: Explanation, misfit: float) -> bool:
-    """Return whether a mistake explains more than effects that the model lacks."""
+def _is_cure(explanation: Explanation, misfit: float, odd: OddJoint | None) -> bool:
+    """Return whether a mistake explains more than effects that the model lacks.
+
+    If one joint's force is odd, it must leave about as little as the model without it.
+    """
     max_misfit = max(MAX_CURED_MISFIT, GAINS.named_rest * misfit)
+    if odd is not None:
+        max_misfit = min(max_misfit, ODD_JOINT.cure * odd.misfit)
     is_large = explanation.gain >= GAINS.named and explanation.misfit < max_misfit
     is_braked = explanation.power > MIN_POWER
     return is_large and is_braked and explanation.remainder < GAINS.remainder
@@ -432,7 +441,7 @@ def _misfit_text(described_log: DescribedLog, fit: RowFit) -> str:
     """Return a sentence about where a model does not fit."""
     rows = described_log.rows
     joint = int(np.argmax(rows.relative_errors(fit.squares)))
-    share = significant(100 * _misfit(fit, rows), 2)
+    share = percent(_misfit(fit, rows))
     return (
         f"the model does not fit: its torque error is {share} %, mainly at joint "
         f"`{described_log.robot.joint_names[joint]}`, and no single mistake in signs, "

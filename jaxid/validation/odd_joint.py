@@ -5,6 +5,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.result_table import percent
+
 from .descriptions import DescribedLog
 from .row_fits import Judge
 
@@ -36,6 +38,7 @@ class OddJointLimits(NamedTuple):
     misfit: float = 0.04
     ratio: float = 3.0  # of the misfit without the next joint over that without it
     correlation: float = 0.9  # from which a gain is said
+    cure: float = 3.0  # misfit with another mistake corrected, over that without it
     log_gain: float = 0.6  # smallest logarithm of a gain that the search does not find
     load: float = 0.25  # least force of a joint that is not passive, over its parts
 
@@ -76,14 +79,29 @@ def _without(described_log: DescribedLog, joint: int) -> OddJoint:
 
 
 def odd_joint_text(described_log: DescribedLog, odd: OddJoint, misfit: float) -> str:
-    """Return a sentence that names the joint, and its gain where one is seen."""
+    """Return a sentence that names the joint."""
     name = f"`{described_log.robot.joint_names[odd.joint]}`"
     return (
-        f"the torque error of the model is {100 * misfit:.2g} %, but "
-        f"{100 * odd.misfit:.2g} % without the force of joint {name}. That force seems "
+        f"the torque error of the model is {percent(misfit)} %, but "
+        f"{percent(odd.misfit)} % without the force of joint {name}. That force seems "
         "to be wrong: check its column (`recording.forces`), its unit and gear "
         "(`recording.force_unit`, `force_gains`), and whether something pulls at the "
         "joint."
+    )
+
+
+def other_cause_text(described_log: DescribedLog, odd: OddJoint, text: str) -> str:
+    """Return that the odd joint may be the cause, if a sentence blames other joints.
+
+    A mistake that concerns several joints rarely leaves the others a perfect fit.
+    """
+    names = described_log.robot.joint_names
+    blamed_joints = [j for j, name in enumerate(names) if f"`{name}`" in text]
+    if blamed_joints == [odd.joint]:
+        return ""
+    return (
+        f" Or only the force of joint `{names[odd.joint]}` is wrong (its column, unit "
+        f"or gear): without it the error is {percent(odd.misfit)} %."
     )
 
 

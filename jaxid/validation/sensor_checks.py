@@ -1,5 +1,6 @@
 """Signs of mistakes that a log shows without a model: faults of sensors and clocks."""
 
+import itertools
 from collections.abc import Iterator, Sequence
 
 import numpy as np
@@ -218,3 +219,20 @@ def constant_forces(robot: Robot, recording: Recording) -> list[str]:
         for name, channel in zip(robot.joint_names, forces.T, strict=True)
         if np.ptp(channel) == 0
     ]
+
+
+def repeated_channels(robot: Robot, recording: Recording) -> list[str]:
+    """Return a sentence about each two joints with the same angles, or forces."""
+    texts = []
+    channels = {"angles": recording.angles, "forces": recording.forces}
+    for quantity, values in channels.items():
+        columns = np.asarray(values).T
+        moving_joints = np.flatnonzero(np.ptp(columns, axis=1) > 0)
+        texts += [
+            f"the {quantity} of joints `{robot.joint_names[i]}` and "
+            f"`{robot.joint_names[j]}` are the same column: check "
+            f"`recording.{quantity}`."
+            for i, j in itertools.combinations(moving_joints, 2)
+            if np.array_equal(columns[i], columns[j])
+        ]
+    return texts

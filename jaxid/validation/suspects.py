@@ -8,6 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.measurement.recording import Recording
+from jaxid.result_table import significant
 from jaxid.robot.rotations import axis_rotation
 
 from .descriptions import DescribedLog
@@ -360,8 +361,8 @@ class SuspectedMistakes:
             samples = described_log.samples_of_bodies(Motion(q, speeds, rest))
             added_rows = described_log.log.rows_of(samples @ bodies.ravel())
             sentence = (
-                f"{part} of the file's bodies seem to have been subtracted from the "
-                "forces, by the log or the drive"
+                f"the log or the drive seems to have subtracted {part} of the file's "
+                "bodies from the forces"
             )
             yield Suspect(
                 sentence,
@@ -414,10 +415,11 @@ class SuspectedMistakes:
         """Return the gain of a joint's force, about a logarithm."""
 
         def sentence(logarithm: float) -> str:
+            gain = significant(math.exp(logarithm), 2)
+            cure = significant(math.exp(-logarithm), 2)
             return (
                 f"the force of joint {self._names[joint]} in the log seems to be "
-                f"{math.exp(logarithm):.2g} times the true one "
-                f"(`recording.force_gains` of {math.exp(-logarithm):.2g})"
+                f"{gain} times the true one (`recording.force_gains` of {cure})"
             )
 
         def rows(logarithm: float) -> Rows:

@@ -12,7 +12,11 @@ from jaxid.trajectory.fourier import random_fourier_series
 from jaxid.validation.clipped_forces import limited_forces
 from jaxid.validation.clock import clock_finding, held_forces
 from jaxid.validation.diagnosis import diagnose
-from jaxid.validation.sensor_checks import channel_findings, constant_forces
+from jaxid.validation.sensor_checks import (
+    channel_findings,
+    constant_forces,
+    repeated_channels,
+)
 
 ROBOT = panda().replace(drives=Drives(7, reduction=[100.0, -100, 100, 100, 50, 50, 50]))
 DT = 0.005
@@ -103,6 +107,17 @@ def test_fast_motors_and_gaps_are_no_faults():
     log = Recording.of(Q, TAU, time=np.where(T < 4.0, T, T + 30.0))
     angles = np.where(T[:, None] < 4.0, Q, Q + 7.0)
     assert channel_findings(ROBOT, dataclasses.replace(log, angles=angles)) == []
+
+
+def test_a_column_that_is_there_twice_is_named():
+    standing = Q.copy()
+    standing[:, 1:3] = 0.5
+    assert repeated_channels(ROBOT, Recording.of(standing, TAU, sample_time=DT)) == []
+    forces = TAU.copy()
+    forces[:, 2] = forces[:, 1]
+    (text,) = repeated_channels(ROBOT, Recording.of(Q, forces, sample_time=DT))
+    names = ROBOT.joint_names
+    assert f"the forces of joints `{names[1]}` and `{names[2]}` are the same" in text
 
 
 @pytest.mark.parametrize("step", [0.5, 2.0, 5.0])

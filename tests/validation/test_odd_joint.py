@@ -11,7 +11,8 @@ from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import random_fourier_series
 from jaxid.validation.descriptions import DescribedLog
 from jaxid.validation.filtered_log import FilteredLog
-from jaxid.validation.mistake_search import find_mistakes
+from jaxid.validation.mistake_search import Explanation, _is_cure, find_mistakes
+from jaxid.validation.odd_joint import OddJoint, other_cause_text
 from jaxid.validation.several_signs import several_signs
 from jaxid.validation.suspects import SuspectedMistakes
 
@@ -62,6 +63,25 @@ def test_a_column_of_something_else_is_named_by_its_joint(log):
     result = mistakes(ARM_MODEL, angles, others)
     (sentence,) = result.unexplained or result.possible
     assert "without the force of joint `shoulder`" in sentence
+
+
+def test_a_mistake_is_no_cure_if_one_joint_left_out_fits_far_better():
+    """Figures of a Kinova arm, one of whose torques was divided by 50."""
+    gravity = Explanation(1.55, 0.055, 0.04, 0.01, "no gravity", is_gain=False)
+    odd = OddJoint(joint=1, misfit=0.0143, gain=0.02, correlation=0.1)
+    assert _is_cure(gravity, 0.31, None)
+    assert not _is_cure(gravity, 0.31, odd)
+    assert _is_cure(gravity._replace(misfit=0.02), 0.31, odd)
+
+
+def test_one_odd_joint_stands_beside_a_mistake_of_several(log):
+    angles, forces = log
+    recording = Recording.of(angles, forces, sample_time=DT)
+    described_log = DescribedLog(ARM_MODEL, FilteredLog(ARM, [recording]))
+    odd = OddJoint(joint=1, misfit=0.012, gain=0.02, correlation=0.1)
+    text = other_cause_text(described_log, odd, "forces of `shoulder` and `elbow`")
+    assert "only the force of joint `shoulder` is wrong" in text
+    assert other_cause_text(described_log, odd, "the sign of `shoulder`") == ""
 
 
 def test_one_joint_in_degrees_is_named(log):
