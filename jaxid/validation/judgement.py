@@ -106,6 +106,8 @@ class Report:
     mistakes: Sequence[str] = ()
     # errors on all logs of the parameters that the robot's file claims; empty without
     claimed: Sequence[TorqueErrors] = ()
+    # the same on the first log, without the friction that it claims
+    claimed_loads: Sequence[TorqueErrors] = ()
     # base parameters that it claims, NaN where it claims none; None without
     claimed_parameters: np.ndarray | None = None
     # inertial parameters of the bodies that it claims [bodies, 10]; None without
@@ -179,7 +181,7 @@ def judge(report: Report) -> Judgement:
         *_judge_bounds(fit),
         *_judge_offsets(fit),
         *_judge_legs(fit),
-        *_judge_claims(report.claimed, report.fit.base.model.robot.joint_names),
+        *_judge_claims(report.claimed_loads, report.fit.base.model.robot.joint_names),
         *_judge_friction(fit, report.identification),
         *_remarks_on_fit(report),
         *(Remark(note) for note in report.every_note if note not in bound_notes),
@@ -389,20 +391,22 @@ def _leg_comparisons(fit: Fit, legs: Sequence[Sequence[int]]) -> list[LegCompari
 
 
 def _judge_claims(
-    claimed: Sequence[TorqueErrors], names: Sequence[str]
+    claimed_loads: Sequence[TorqueErrors], names: Sequence[str]
 ) -> Iterator[Remark]:
     """Compare the size of the forces with those of the bodies of the robot's file.
 
     A fit of forces in a wrong unit is as good as any, but its masses are not.
     """
-    for log in claimed[:1]:
+    for log in claimed_loads:
         claims = np.linalg.norm(log.predicted, axis=0)
         sizes = np.linalg.norm(log.measured, axis=0)
         cause = (
             "are the forces currents (`recording.torque_constants`), motor torques "
             "(`forces_side`) or in another unit (`force_unit`), or is the file wrong?"
         )
-        ratio = float(np.linalg.norm(claims) / max(np.linalg.norm(sizes), 1e-300))
+        size = float(np.linalg.norm(sizes))
+        # A log without forces has findings of its own.
+        ratio = float(np.linalg.norm(claims)) / size if size > 0 else 0.0
         if ratio > MAX_CLAIM_RATIO:
             forces = f"{significant(ratio, 2)} times the forces of the logs"
             text = (

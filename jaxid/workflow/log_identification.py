@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -198,6 +198,7 @@ def identify_logs(
         doubts=[*doubts, *mistakes.doubts],
         mistakes=mistakes.certain,
         claimed=claims.errors,
+        claimed_loads=claims.load_errors,
         claimed_parameters=claims.parameters,
         claimed_bodies=claims.bodies,
         robot_file=setup.robot_file,
@@ -260,6 +261,7 @@ class Claims(NamedTuple):
     """Parameters that the robot's file claims, compared with logs."""
 
     errors: tuple[TorqueErrors, ...] = ()  # torque errors on each log
+    load_errors: tuple[TorqueErrors, ...] = ()  # without friction, on the first log
     parameters: np.ndarray | None = None  # base parameters; NaN without a claim
     bodies: np.ndarray | None = None  # their inertial parameters [bodies, 10]
 
@@ -271,11 +273,30 @@ def errors_of_claims(setup: Setup, fit: Fit, logs: Sequence[Observations]) -> Cl
     values = setup.robot_file.claims()
     if not values:
         return Claims()
+    parameters = _base_parameters(fit, values)
+    errors = _torque_errors_of(fit, parameters, logs)
+    # Files often state friction that nobody has measured.
+    loads = {k: x for k, x in values.items() if not k.startswith(("fv", "fc"))}
+    load_errors = errors[:1]
+    if len(loads) < len(values):
+        load_errors = _torque_errors_of(fit, _base_parameters(fit, loads), logs[:1])
     names = fit.base.model.parameter_names
-    standard_parameters = [values.get(name, 0.0) for name in names]
-    parameters = np.asarray(fit.base.from_standard(standard_parameters))
-    claimed_fit = dataclasses.replace(fit, parameters=parameters)
-    errors = tuple(torque_errors(claimed_fit, log) for log in logs)
     is_claimed = [names[k] in values for k in fit.base.indices]
     claimed_parameters = np.where(is_claimed, parameters, np.nan)
-    return Claims(errors, claimed_parameters, setup.robot_file.bodies())
+    bodies = setup.robot_file.bodies()
+    return Claims(errors, load_errors, claimed_parameters, bodies)
+
+
+def _base_parameters(fit: Fit, values: Mapping[str, float]) -> np.ndarray:
+    """Return base parameters of standard ones, which are 0 unless they are named."""
+    names = fit.base.model.parameter_names
+    standard_parameters = [values.get(name, 0.0) for name in names]
+    return np.asarray(fit.base.from_standard(standard_parameters))
+
+
+def _torque_errors_of(
+    fit: Fit, parameters: np.ndarray, logs: Sequence[Observations]
+) -> tuple[TorqueErrors, ...]:
+    """Return torque errors of other parameters of the model of a fit."""
+    other_fit = dataclasses.replace(fit, parameters=parameters)
+    return tuple(torque_errors(other_fit, log) for log in logs)

@@ -20,6 +20,7 @@ from jaxid.validation.judgement import (
     judge,
 )
 from jaxid.validation.torque_errors import joint_errors
+from jaxid.workflow.log_identification import errors_of_claims
 
 EVIL = "<script>alert('&\"')</script>"  # as in conftest.py
 
@@ -254,10 +255,23 @@ def test_forces_far_below_those_of_the_files_bodies_are_doubted(
             first, measured=forces, predicted=size * np.asarray(first.measured)
         )
         errors = (first,), (second,), validation.definiteness
-        remarks = judge(Report(fit, *errors, claimed=(claims,))).findings
+        remarks = judge(Report(fit, *errors, claimed_loads=(claims,))).findings
         doubts = [x for x in remarks if "bodies in the robot's file" in x.text]
         assert bool(doubts) == (is_doubted and bool(np.any(forces)))
         assert all("need 11 times" in doubt.text for doubt in doubts)
+
+
+def test_friction_that_the_file_states_is_no_load_of_its_bodies(fit):
+    """Many files state a friction of 1 in each joint that nobody has measured."""
+    values = {"m1": 8.0, "fv1": 100.0, "fc1": 0.0}
+    robot_file = SimpleNamespace(claims=lambda: values, bodies=lambda: None)
+    q, qd, qdd = np.random.default_rng(0).standard_normal((3, 50, 2))
+    log = jid.Observations.of(q, qd, qdd, np.ones((50, 2)), sample_time=0.01)
+    claims = errors_of_claims(SimpleNamespace(robot_file=robot_file), fit, [log, log])
+    (loads,) = claims.load_errors
+    np.testing.assert_allclose(loads.predicted[:, 0], 8.0 * qdd[:, 0])
+    with_friction = 8.0 * qdd[:, 0] + 100.0 * qd[:, 0]
+    np.testing.assert_allclose(claims.errors[1].predicted[:, 0], with_friction)
 
 
 def test_a_weight_that_gravity_does_not_explain_is_pointed_out(fit):
