@@ -12,8 +12,8 @@ from .error_derivatives import Unknowns
 from .problem import CalibrationProblem
 from .wrong_poses import pose_sizes
 
-SLIDE_FACTOR = 0.1
-"""Compliance of a joint that slides [m/N] by that of one that turns [rad/(N m)]."""
+SLIDE_FACTOR = 2e-3
+"""Compliance of a joint that slides [m/N], by the prior's deflection [rad]."""
 
 
 class GeometryPrior(NamedTuple):
@@ -21,24 +21,24 @@ class GeometryPrior(NamedTuple):
 
     shift: float  # of the origins of joints [m]
     turn: float  # of the origins of joints [rad]
-    compliance: float  # of the joints [rad/(N m)]
+    deflection: float  # of the joints under the robot's largest torque [rad]
 
     @property
     def words(self) -> str:
         """The prior in words."""
         return (
             f"origins within {1e3 * self.shift:g} mm and {1e3 * self.turn:g} mrad, "
-            f"compliances within {1e6 * self.compliance:g} µrad/(N m) (standard "
-            "deviations)"
+            f"deflections by the largest torque of gravity within "
+            f"{1e3 * self.deflection:g} mrad (standard deviations)"
         )
 
 
-MIDDLE_PRIOR = GeometryPrior(1e-3, 3e-3, 1e-5)
+MIDDLE_PRIOR = GeometryPrior(1e-3, 3e-3, 5e-3)
 """Prior with which wrong poses are found, and where the choice begins."""
 PRIORS = tuple(
     itertools.starmap(
         GeometryPrior,
-        itertools.product((3e-4, 1e-3, 3e-3), (1e-3, 3e-3, 1e-2), (1e-5, 1e-4)),
+        itertools.product((3e-4, 1e-3, 3e-3), (1e-3, 3e-3, 1e-2), (5e-4, 5e-3)),
     )
 )
 """Priors that are tried."""
@@ -50,7 +50,9 @@ def prior_scales(
     """Return the prior deviation of each unknown: 1 m and 1 rad for frames."""
     robot = problem.robot
     shift_and_turn = np.repeat([prior.shift, prior.turn], 3)
-    compliances = prior.compliance * np.where(robot.revolute, 1.0, SLIDE_FACTOR)
+    # Small arms are softer, and weigh less.
+    factors = np.where(robot.revolute, 1.0 / problem.largest_torque, SLIDE_FACTOR)
+    compliances = prior.deflection * factors
     return Unknowns(
         np.tile(shift_and_turn, (robot.bodies, 1)),
         has_compliance * compliances,

@@ -26,6 +26,10 @@ from .observations import AbstractObservation, FrameKey
 
 NEWTON_STEPS = 5
 """Steps to coordinates without errors, which double the digits."""
+RANDOM_POSES = 200
+"""Number of poses in which the largest torque of gravity is sought."""
+MIN_TORQUE = 1.0
+"""Torque of gravity that arms with less are taken to have [N m]."""
 
 
 class Linearisation(NamedTuple):
@@ -78,6 +82,20 @@ class CalibrationProblem:
         """Length of the stretched robot, without joints that slide [m]."""
         offsets = np.linalg.norm(self.robot.offset, axis=1)
         return float(offsets.sum() + np.linalg.norm(self.robot.tip_offset))
+
+    @cached_property
+    def largest_torque(self) -> float:
+        """Largest torque of gravity in random poses of the robot [N m].
+
+        Recorded poses do not change it, so that those of a session that is held out
+        have no effect.
+        """
+        angles = np.random.default_rng(0).uniform(
+            -np.pi, np.pi, (RANDOM_POSES, self.robot.joints)
+        )
+        q = np.where(self.robot.revolute, angles, 0.0)
+        torques = np.abs(gravity_torques(self.robot, self.bodies, q))
+        return float(torques[:, self.robot.revolute].max(initial=MIN_TORQUE))
 
     @property
     def frame_scales(self) -> Vector:

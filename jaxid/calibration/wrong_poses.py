@@ -18,7 +18,7 @@ EQUAL_STEPS = 3
 class ErrorLimits(NamedTuple):
     """Errors of poses, in units of the typical error.
 
-    Of normal errors of a point in space 0.3 % are beyond the largest.
+    Normal errors are practically never beyond the largest.
     """
 
     half_weight: float = 3.0

@@ -281,3 +281,27 @@ def test_real_iiwa(shared_data):
     fit = jid.calibrate(robot, observations, bodies=bodies)
     assert fit.mean_error(fit.held_out.nominal) > 0.7e-3
     assert fit.mean_error(fit.held_out.calibrated) <= 0.16e-3
+
+
+def test_soft_light_arms_are_calibrated_like_stiff_heavy_ones(robot):
+    """They deflect as much: the prior is one of deflections, not of compliances."""
+    compliances = np.array([0.0, 4e-5, 0.0, 8e-5, 0.0, 0.0, 0.0])
+    arm = TrueArm(robot, true_origins(robot), compliances)
+    observations = []
+    for session in range(3):
+        q = random_poses(robot, 15, session)
+        points = arm.placements(q, (0.02, 0.0, 0.1))[1]
+        observations.append(
+            jid.calibration.MeasuredPosition(f"s{session}", q, positions=points)
+        )
+    heavy, light = (
+        jid.calibrate(
+            robot,
+            observations,
+            bodies=jid.calibration.rough_bodies(robot, share * MASSES),
+        )
+        for share in (1.0, 0.1)
+    )
+    assert heavy.compliances[[1, 3]] == pytest.approx([4e-5, 8e-5], rel=0.1)
+    assert light.compliances == pytest.approx(10.0 * heavy.compliances, rel=1e-6)
+    assert light.origins == pytest.approx(heavy.origins, abs=1e-9)
