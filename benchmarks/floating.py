@@ -9,12 +9,14 @@ motion and a noise of its own; settings are those of `jaxid identify`.
 
     python benchmarks/floating.py                   # Go2: half an hour
     python benchmarks/floating.py --quick
+    python benchmarks/floating.py --lifts           # what each lifted foot tells
     python benchmarks/floating.py --robot G1        # or "ANYmal C"; --all for all
 """
 
 import argparse
 import re
 import tempfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -170,10 +172,12 @@ def mjcf(robot: Legged, model: pin.Model) -> str:
 class Plan:
     """Reference of the joints: the base sways, and each foot is lifted in its turn."""
 
-    def __init__(self, robot: Legged, model: pin.Model, seed: int, lifts: bool):
+    def __init__(
+        self, robot: Legged, model: pin.Model, seed: int, lifted_feet: Sequence[int]
+    ):
         rng = np.random.default_rng(seed)
         self.robot, self.model, self.data = robot, model, model.createData()
-        self.lifts = lifts
+        self.lifted_feet = lifted_feet
         self.q = pin.neutral(model)
         names = [*model.names][2:]
         for word, angle in robot.pose.items():
@@ -198,7 +202,7 @@ class Plan:
         """Return the angles at a time, a multiple of 5 ms."""
         count = len(self.feet)
         phase = int(t // PHASE) % (count + 1)
-        lifted = phase - 1 if phase and self.lifts else None
+        lifted = phase - 1 if phase - 1 in self.lifted_feet else None
         rise = np.sin(np.pi * (t % PHASE) / PHASE) ** 2
         waves = np.sin(2 * np.pi * self.frequency * t + self.phase).sum(1)
         sway = min(1.0, t / 2) * np.array(self.robot.sway) * waves / 1.5
@@ -255,7 +259,7 @@ def simulate(
     seconds: float = 40.0,
     *,
     load: pin.Inertia | None = None,
-    lifts: bool = True,
+    lifted_feet: Sequence[int] = range(4),
 ) -> dict[str, np.ndarray]:
     """Return the channels of a log without noise, and how upright the base was.
 
@@ -264,7 +268,7 @@ def simulate(
     pinned = robot.pinned()
     if load is not None:
         pinned.inertias[1] = pinned.inertias[1] + load
-    plan: Any = Plan(robot, robot.pinned(), seed, lifts)
+    plan: Any = Plan(robot, robot.pinned(), seed, lifted_feet)
     m = mujoco.MjModel.from_xml_string(mjcf(robot, pinned))
     d = mujoco.MjData(m)
     feet = [m.geom(f"f{number}").id for number in range(len(robot.feet))]
@@ -454,6 +458,29 @@ class Study:
         return float(np.mean(agreements))
 
 
+def lifted_feet_table(name: str, draws: int, seconds: float) -> None:
+    """Print which estimates of each leg can be trusted, by the feet that are lifted."""
+    study = Study(QUADRUPEDS[name], seconds)
+    body_numbers = [int(re.findall(r"[0-9]+", x)[-1]) for x in study.base.names]
+    legs = (np.array(body_numbers) + 2) // 3  # the trunk is 0
+    print("lifted feet; trusted estimates of trunk and legs; open; total mass")
+    for count in range(5):
+        for seed in range(1, draws + 1):
+            log = study.log(seed, lifted_feet=range(count))
+            fit = study.fit(recording(log, np.random.default_rng(seed)))
+            is_trusted = np.array([x.name == "GOOD" for x in fit.trust])
+            shares = [
+                f"{np.sum(is_trusted[legs == leg])}/{np.sum(legs == leg)}"
+                for leg in range(5)
+            ]
+            mass, width = study.mass(fit)
+            print(
+                f"{count}; {' '.join(shares)}; {len(fit.undetermined)}; "
+                f"{mass:.2f} ± {width:.2f} kg",
+                flush=True,
+            )
+
+
 def late(log: dict[str, np.ndarray], seconds: float) -> dict[str, np.ndarray]:
     """Return a log whose flags of contact are late."""
     steps = round(seconds / SAMPLE_TIME)
@@ -560,9 +587,13 @@ if __name__ == "__main__":
     parser.add_argument("--draws", type=int, default=20)
     parser.add_argument("--robot", default="Go2", choices=[*QUADRUPEDS, "G1"])
     parser.add_argument("--all", action="store_true", help="all robots")
+    parser.add_argument("--lifts", action="store_true", help="what each foot tells")
     parser.add_argument("--json")
     options = parser.parse_args()
     draws, seconds = (2, 24.0) if options.quick else (options.draws, 40.0)
+    if options.lifts:
+        lifted_feet_table(options.robot, min(draws, 2), seconds)
+        raise SystemExit
     rows = []
     for name in [*QUADRUPEDS, "G1"] if options.all else [options.robot]:
         if name == "G1":

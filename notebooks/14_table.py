@@ -102,6 +102,8 @@ for robot, by_method in results.items():
 #
 # The page: [one table for the field](../benchmarks/arms/README.md); it says how to add your robot and your method.
 #
+# Next: [a robot on legs](15_legs.ipynb).
+#
 # ## Exercise
 #
 # Which method has the largest gap between torque error and simulation?

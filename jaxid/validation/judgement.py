@@ -14,6 +14,7 @@ from jaxid.result_table import Remark, Status, percent, significant, sort_remark
 from jaxid.robot.collision_geometry import BodyShape
 from jaxid.robot.contacts import legs_of
 
+from .contact_flags import standing_feet_findings
 from .torque_errors import (
     Definiteness,
     TorqueErrors,
@@ -180,6 +181,7 @@ def judge(report: Report) -> Judgement:
         _judge_mass_matrix(report.definiteness),
         *_judge_bounds(fit),
         *_judge_offsets(fit),
+        *(Remark(text, Status.DOUBTFUL) for text in standing_feet_findings(fit)),
         *_judge_legs(fit),
         *_judge_claims(report.claimed_loads, report.fit.base.model.robot.joint_names),
         *_judge_friction(fit, report.identification),

@@ -5,7 +5,11 @@ import pinocchio as pin
 import pytest
 
 import jaxid as jid
-from jaxid.validation.contact_flags import check_contacts, imu_findings
+from jaxid.validation.contact_flags import (
+    check_contacts,
+    imu_findings,
+    standing_feet_findings,
+)
 
 INERTIAL = """<inertial><mass value="{mass}"/><origin xyz="0.01 0.02 {z}"/>
 <inertia ixx="{i}" iyy="{i}" izz="{j}" ixy="0" ixz="0" iyz="0"/></inertial>"""
@@ -158,7 +162,7 @@ def test_wrong_signals_of_the_imu_are_named(dog, base, key, change, words):
 
 
 def test_logs_of_legs_are_identified_and_equal_legs_compared(dog, base, tmp_path):
-    """The mass is right, and the joint whose friction is larger is named alone."""
+    """The mass is right; a joint of larger friction and a leg that stands are named."""
     folder, log = dog
     speeds = np.gradient(log["angles"], STEP, axis=0)
     friction = np.full(12, 0.3)
@@ -191,6 +195,15 @@ def test_logs_of_legs_are_identified_and_equal_legs_compared(dog, base, tmp_path
     (difference,) = [text for text in texts if "other legs" in text]
     assert "`b2`" in difference
     assert "1.0 and not 0.30" in difference
+    assert not any("lift these feet" in text for text in texts)
+
+    # Without its last phase the log never lifts the foot `d`.
+    part = {key: x[: -round(PHASE / STEP)] for key, x in log.items()}
+    recording = jid.Recording.of(**part, sample_time=STEP)
+    smooth = jid.ZeroPhaseButterworth(10.0)
+    fit = jid.identify(base, jid.observe(recording, base.model.robot, smooth))
+    (sentence,) = standing_feet_findings(fit)
+    assert [foot for foot in FEET if f"`{foot}`" in sentence] == ["dfoot"]
 
 
 def test_no_motion_is_designed_for_a_floating_base(base):
