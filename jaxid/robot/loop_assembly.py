@@ -217,7 +217,8 @@ def _require_closed(robot: Robot, distances: np.ndarray) -> None:
 
 def _with_note(robot: Robot, pose: np.ndarray) -> Robot:
     """Return the robot with a note on a pose that its description does not state."""
-    coordinates = zip(robot.body_names, pose, strict=True)
+    # Without the rounding of the search.
+    coordinates = zip(robot.body_names, np.round(pose, 6) + 0.0, strict=True)
     places = ", ".join(f"`{name}` {value:.4g}" for name, value in coordinates)
     note = (
         "the loops are open in all poses of the description; they were closed from the "

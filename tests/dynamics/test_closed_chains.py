@@ -188,6 +188,23 @@ def test_open_loops_are_closed_from_the_nearest_pose_which_a_note_states(tmp_pat
     assert any("closed from the nearest" in note for note in robot.notes)
 
 
+PRESS = """<mujoco><worldbody>
+<body pos="0 0 0.5"><joint name="crank" axis="0 1 0"/><geom size="0.1"/>
+<body pos="0.12 0 0"><joint name="rod" axis="0 1 0"/><geom size="0.1"/>
+<site name="a" pos="0.4 0 0"/></body></body>
+<body pos="0.35 0 0.2"><joint name="rocker" axis="0 1 0"/><geom size="0.1"/>
+<site name="b" pos="0 0 0.3"/>
+<body pos="0 0 0.3"><joint name="tool" axis="0 1 0"/><geom size="0.1"/></body></body>
+</worldbody><equality><connect site1="a" site2="b"/></equality>
+<actuator><motor joint="crank"/><motor joint="tool"/></actuator></mujoco>"""
+
+
+def test_a_joint_beside_an_open_loop_stays_at_zero_in_the_note(tmp_path):
+    path = tmp_path / "press.xml"
+    path.write_text(PRESS)
+    assert "`tool` 0, `rod`" in jid.load_mjcf(path).notes[-1]
+
+
 def test_a_body_that_a_weld_joins_is_that_of_a_joint(tmp_path):
     """The rod of the five-bar is cut behind its joint, and welded to its other part."""
     mechanism = MECHANISMS["five-bar"]
