@@ -32,8 +32,8 @@ class WitnessLimits(NamedTuple):
 LIMITS = WitnessLimits()
 CAUSES = (
     "the drive or the log has subtracted it (gravity alone or a model's prediction), "
-    "`robot.gravity` does not match the mount, or a link, an axis or a zero of the "
-    "angles is wrong"
+    "`robot.gravity` does not match the mount, the columns stand in another "
+    "order, or a link, an axis or a zero of the angles is wrong"
 )
 """Usual causes of another gravity."""
 
@@ -68,9 +68,10 @@ class GravityWitness(NamedTuple):
     def sentence(self) -> str:
         """Say how much differs, and the usual causes."""
         difference = f"{percent(self.difference)} %"
-        text = f"gravity in the forces differs by {difference} from that of"
+        text = "gravity in the forces differs"
         if self.is_absent:
-            text = f"the forces seem to lack gravity: {difference} differ from that of"
+            text = "the forces seem to lack gravity: what they contain differs"
+        text = f"{text} by {difference} from that of"
         return f"{text} the file's bodies: {CAUSES}, or the file's bodies are wrong."
 
 
