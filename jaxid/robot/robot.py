@@ -483,7 +483,7 @@ class Robot(Summarised, Hashable):
         if self.source:
             facts.append(("source", self.source))
         return Table(
-            f"{self.name}: {self.joints} joints",
+            f"{self.name}: {len(self.driven)} joints",
             Column("joint", self.joint_names),
             Column("parent", [names[p + 1] for p in self.parent[: self.joints]]),
             *units,

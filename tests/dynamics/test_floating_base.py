@@ -78,6 +78,7 @@ def test_parameters_of_the_file_are_those_of_all_bodies():
     assert friction == [f"fv{number}" for number in range(1, 13)]
     # Standing still on known forces, the force on the base is the weight.
     n = len(robot.driven)
+    assert str(robot).strip().startswith(f"{robot.name}: 12 joints\n")
     zeros = np.zeros((1, n))
     up = np.array([[0.0, 0.0, 9.81]])
     still = np.zeros((1, 3))
