@@ -243,9 +243,9 @@ def test_damaged_results(folder, first, run):  # noqa: F811
     whole = path.read_text(encoding="utf-8")
     for damaged in (whole[:-20], 100_000 * "[", "{}", "", "PK"):
         path.write_text(damaged, encoding="utf-8")
-        arguments = ("experiment.toml", "first", "b.csv", "-o", "s")
-        assert refused(run("identify", *arguments), "model.json")
-    assert not (folder / "s").exists()
+        arguments = ("first", "--to", "c", "-o", "arm.c")
+        assert refused(run("export", *arguments), "model.json")
+    assert not (folder / "arm.c").exists()
 
 
 def test_a_terminal_of_few_characters_shows_the_rest_as_marks(folder, monkeypatch):  # noqa: F811

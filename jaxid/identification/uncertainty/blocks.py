@@ -31,7 +31,7 @@ from .result import AbstractUncertainty, Uncertainty, rescale_covariance
 ResidualBlock = tuple[Matrix, Vector]
 """Derivatives of a block's weighted forces by the unknowns, and the residuals."""
 MIN_REMAINDER = 1e-3
-"""Part of a direction that the other blocks must determine, to move without a block.
+"""Share of the information of a direction that the other blocks must have.
 
 A leg that is lifted in one block only tells its friction and rotors there.
 """
@@ -93,23 +93,25 @@ def block_covariance(
     move: without it nothing is known of them, and rounding would move all unknowns.
     """
     B = np.asarray(inverse)
-    # The least squares below compare unknowns, which must not depend on their units.
-    sizes = np.sqrt(np.maximum(np.diag(B), 0.0))
-    scale = np.where(sizes > 0, sizes, 1.0)
-    scaled_inverse = B / np.outer(scale, scale)
+    # Eigenvalues compare unknowns, which must not depend on their units.
+    deviations = np.sqrt(np.maximum(np.diag(B), 0.0))
+    scale = np.where(deviations > 0, deviations, 1.0)
+    values, vectors = np.linalg.eigh(B / np.outer(scale, scale))
+    # In these coordinates the information of all blocks together is the identity.
+    to_unknowns = scale[:, None] * vectors * np.sqrt(np.maximum(values, 0.0))
 
     steps = []
     for derivatives, residuals in blocks:
-        rows = derivatives * scale
-        information = rows.T @ rows
-        gradient = rows.T @ residuals
-        remaining_part = np.eye(len(B)) - scaled_inverse @ information
-        right_side = scaled_inverse @ gradient
-        step, *_ = np.linalg.lstsq(remaining_part, right_side, rcond=MIN_REMAINDER)
-        steps.append(scale * step)
+        rows = derivatives @ to_unknowns
+        left_vectors, sizes, directions = np.linalg.svd(rows, full_matrices=False)
+        remaining_parts = 1.0 - sizes**2
+        is_shared = remaining_parts > MIN_REMAINDER
+        gains = np.where(is_shared, sizes / np.where(is_shared, remaining_parts, 1), 0)
+        step = directions.T @ (gains * (left_vectors.T @ residuals))
+        steps.append(to_unknowns @ step)
     dof = len(steps) - 1.0
-    deviations = np.array(steps) - np.mean(steps, axis=0)
-    return dof / len(steps) * deviations.T @ deviations, dof
+    changes = np.array(steps) - np.mean(steps, axis=0)
+    return dof / len(steps) * changes.T @ changes, dof
 
 
 def bootstrap(
