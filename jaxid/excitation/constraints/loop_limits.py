@@ -56,7 +56,12 @@ class LoopLimits(AbstractConstraint):
     def entries(self, robot):
         """Return the quantities that have a limit, in the same order."""
         entries = [
-            Finding("the distance of the loops from closing", SIZE**2, "m²", SIZE**4),
+            Finding(
+                "the square of the distance of the loops from closing",
+                SIZE**2,
+                "m²",
+                SIZE**4,
+            ),
             Finding(
                 "the determinant of the loops",
                 self.min_share,
