@@ -54,6 +54,8 @@ panel.axvline(1.0, color="0.5")
 panel.set_yticks(rows, list(errors))
 panel.invert_yaxis()
 panel.set(xlabel="error over that of the best rival", xscale="log")
+panel.set_xticks([0.4, 0.6, 0.8, 1.0], ["0.4", "0.6", "0.8", "1"])
+panel.minorticks_off()
 panel.legend()
 
 # %% [markdown]
@@ -65,6 +67,8 @@ panel.legend()
 # %%
 figure, panel = plt.subplots(figsize=(9, 4))
 top = 3e3
+COLOURS = 5  # the next robots have the same colours and another shape
+robots_of_torques = []
 for robot, by_method in results.items():
     models = [x for x in by_method.values() if x.get("simulations")]
     if not models or models[0]["kind"] != "torques":
@@ -72,11 +76,18 @@ for robot, by_method in results.items():
     torque_errors = np.array([100 * x["error"] for x in models])
     distances = np.array([1e3 * x["simulations"][1] for x in models])
     moves = distances < top
-    points = panel.loglog(torque_errors[moves], distances[moves], "o", label=robot)
-    colour = points[0].get_color()
+    number = len(robots_of_torques)
+    robots_of_torques.append(robot)
+    colour = f"C{number % COLOURS}"
+    shape = "os"[number // COLOURS]
+    panel.loglog(
+        torque_errors[moves], distances[moves], shape, color=colour, label=robot
+    )
     count = np.count_nonzero(~moves)
     panel.loglog(torque_errors[~moves], np.full(count, top), "x", color=colour)
 panel.set(xlabel="torque error [%]", ylabel="position error after 0.5 s [mrad or mm]")
+panel.set_xticks([1, 2, 5, 10, 20, 50], ["1", "2", "5", "10", "20", "50"])
+panel.minorticks_off()
 panel.legend(loc="center left", bbox_to_anchor=(1.0, 0.5))
 
 # %% [markdown]
