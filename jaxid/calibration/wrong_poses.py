@@ -91,8 +91,10 @@ def find_wrong_poses(
         sizes = pose_sizes(end.linearisation.errors, problem.poses.deviations)
         # With more unknowns, errors of poses are smaller, and of those that are left
         # out larger.
-        left = share_of_errors_left(problem, end.equations, scales, session_weights)
-        typical_size = np.median(sizes[is_used]) / left
+        error_share = share_of_errors_left(
+            problem, end.equations, scales, session_weights
+        )
+        typical_size = np.median(sizes[is_used]) / error_share
         typical_size = max(typical_size, LIMITS.min_typical_size)
         relative_sizes = np.where(is_used, sizes / typical_size, 0.0)
         weights = 1.0 / (1.0 + (relative_sizes / LIMITS.half_weight) ** 2) ** 2

@@ -65,8 +65,8 @@ def require_right_robot(
         "joints right, and the unit of measured lengths?"
     )
     if is_explained:
-        left = significant(1e3 * errors[words])
-        cure = f"{words}, it is {left} mm: correct this first."
+        remaining_error = significant(1e3 * errors[words])
+        cure = f"{words}, it is {remaining_error} mm: correct this first."
     size = f"{significant(1e3 * error)} mm"
     if error > LIMITS.shown_error:
         size = "more than a metre"
