@@ -262,7 +262,7 @@ SLIPS = {
     "held 40": Slip(_log(_held(40)), ("low-pass", "later", "held")),
     "degrees": Slip(_log(_degrees), ("deg",), ("all",)),
     "motor side": Slip(_log(_motor_side), ("gears",), ("all",)),
-    "commanded": Slip(_log(_commanded), ("commanded",), ("all",)),
+    "commanded": Slip(_log(_commanded), ("`recording.commands` seem",), ("all",)),
     "jitter 2 ms": Slip(_log(_jitter), ("clock", "stamps"), ("all",)),
     "lost rows": Slip(_log(_lost_rows), ("rows",), ("all",)),
     "doubled rows": Slip(_log(_doubled_rows), ("rows",), ("all",)),

@@ -332,8 +332,6 @@ def _search(
         return Mistakes(explained=(_driving_text(described_log, powers),))
     if is_single and _is_possible(equal_results[0], misfit):
         return Mistakes(possible=(f"possible, but not sure: {texts}.",))
-    if odd is not None:
-        return Mistakes(possible=(odd_joint_text(described_log, odd, misfit),))
     return Mistakes()
 
 
