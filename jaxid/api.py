@@ -72,7 +72,6 @@ from .identification.problem import RegressionProblem as RegressionProblem
 from .measurement import filters as filters
 from .measurement.columns import Columns as Columns
 from .measurement.filters import (
-    Decimation as Decimation,
     Subsample as Subsample,
     ZeroPhaseButterworth as ZeroPhaseButterworth,
 )

@@ -175,7 +175,6 @@ KEYS: dict[str, TomlTable] = {
     },
     "rows": {
         "step": Count,
-        "factors": list[Count],
         "min_speed": Magnitude | list[Magnitude],
     },
     "estimator": {

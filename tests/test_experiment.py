@@ -245,9 +245,8 @@ def test_filters_and_rows(load):
     assert found == jid.ZeroPhaseButterworth(20.0, 2, np.inf, 0.1)
     found = load(f'{ARM}[filter]\nkind = "paper"\nvelocity = 900').setup.filter
     assert found == jid.filters.PaperFilter(900.0, 100.0)
-    assert load(ARM + "[rows]\nstep = 50\n").setup.decimation == jid.Subsample(50)
-    experiment = load(ARM + "[rows]\nfactors = [10, 5]\nmin_speed = [0.1, 2]\n")
-    assert experiment.setup.decimation == jid.Decimation((10, 5))
+    experiment = load(ARM + "[rows]\nstep = 50\nmin_speed = [0.1, 2]\n")
+    assert experiment.setup.decimation == jid.Subsample(50)
     np.testing.assert_array_equal(experiment.setup.min_speed, [0.1, 2.0])
 
 
@@ -322,8 +321,6 @@ REFUSALS = [
     ),
     (BUTTERWORTH + "cutoff = []", "`filter.cutoff`"),
     (ARM + "[filter]\nkind = 'paper'\ncutoff = 3", "`filter.cutoff`.*velocity"),
-    (ARM + "[rows]\nstep = 2\nfactors = [2]", "`step`.*`factors`"),
-    (ARM + "[rows]\nfactors = [50]", "`factors`"),
     (ARM + "[estimator]\nweights = 'maximum_forces'", "`weights = .*`joint1`"),
     (
         ARM + "[estimator]\nkind = 'least_squares'\nweights = 'residual_variances'",

@@ -290,35 +290,23 @@ def build_filters(table: TomlTable) -> list[filters.AbstractFilter]:
 def build_rows(
     robot: Robot,
     *,
-    step: int | None = None,
-    factors: list[int] | None = None,
+    step: int = 1,
     min_speed: float | list[float] | None = None,
-) -> tuple[filters.AbstractDecimation, Float[np.ndarray, " joints"] | None]:
+) -> tuple[filters.Subsample, Float[np.ndarray, " joints"] | None]:
     """Rows of the least-squares problem, and samples that become rows.
 
     Args:
         robot: Robot with the joints.
         step: Number of samples from one row to the next; the filter must remove
             frequencies above half of the resulting rate.
-        factors: Factors of stages that low-pass and decimate, instead of `step`, like
-            `[10, 10]`: 13 at most.
         min_speed: Speed below which rows do not count [rad/s or m/s], like `0.05`; or a
             list.
-
-    Raises:
-        InputError: If two ways are asked for, or a factor is too large.
     """
-    if step is not None and factors is not None:
-        raise InputError(
-            "give `step` or `factors`, which also low-pass filter, but not both."
-        )
     speeds = None
     if min_speed is not None:
         speed = _speed(robot, "min_speed", min_speed)
         speeds = np.broadcast_to(speed, (robot.joints,)).copy()
-    if factors is not None:
-        return filters.Decimation(tuple(factors)), speeds
-    return filters.Subsample(step or 1), speeds
+    return filters.Subsample(step), speeds
 
 
 KEYS_OF_ROWS = ("weights", "ridge")

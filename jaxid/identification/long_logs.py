@@ -1,7 +1,7 @@
 """Factors of long logs: one compiled loop over the samples, on all cores.
 
-The loop evaluates the columns of a chunk, filters and decimates them to rows by matrix
-products with the impulse responses, and adds up the Gram matrix of each joint's rows;
+The loop evaluates the columns of a chunk, filters them to rows by matrix
+products with the impulse response, and adds up the Gram matrix of each joint's rows;
 columns live only within an iteration, in float64. A Gram matrix of the columns
 themselves would lose twice the digits of their condition number. So a few parts of the
 log give a first triangle for each joint, and the pass adds up the products of columns
@@ -55,34 +55,16 @@ BlockGrams = tuple[int, Grams]
 """Index of a block of time, and products of rows in it."""
 
 
-class Stage(NamedTuple):
-    """Zero-phase filter, and the decimation after it."""
-
-    response: Vector  # response to an impulse, of odd length
-    factor: int
-
-
 def suits(observations: Observations) -> bool:
-    """Return whether the filters of a log are short enough to compile for."""
-    stages = _stages(observations)
+    """Return whether the filter of a log is short enough to compile for."""
     # A filter is a matrix product of so many products for each row and column.
-    cost = sum(len(stage.response) / stage.factor for stage in stages)
-    return cost <= MAX_COST
+    lags = len(filter_response(observations))
+    return lags <= MAX_COST * observations.decimation.step
 
 
-def _stages(observations: Observations):
-    """Return the stages of decimation that change something; the first one filters."""
-    decimation = observations.decimation
-    low_pass = observations.filter.low_pass(observations.sample_time)
-    filter_response = impulse_response(low_pass)
-    stages = []
-    for k, factor in enumerate(decimation.stages):
-        response = impulse_response(decimation.low_pass(k))
-        if k == 0:
-            response = np.convolve(filter_response, response)
-        if factor > 1 or len(response) > 1:
-            stages.append(Stage(response, factor))
-    return stages
+def filter_response(observations: Observations) -> Vector:
+    """Return the response of the filter of forces and columns to an impulse."""
+    return impulse_response(observations.filter.low_pass(observations.sample_time))
 
 
 def impulse_response(low_pass: LowPass) -> Vector:
@@ -93,45 +75,32 @@ def impulse_response(low_pass: LowPass) -> Vector:
     return low_pass(impulse)[2 * half : 4 * half + 1]
 
 
-class StageShape(NamedTuple):
-    """Sizes of a stage of the loop."""
-
-    factor: int  # decimation factor
-    lags: int  # length of the response
-    delay: int  # rows by which its results come late
-
-
 class LoopShape(NamedTuple):
-    """Sizes of the loop and of its stages."""
+    """Sizes of the loop."""
 
-    samples: int  # samples of an iteration
+    step: int  # samples for each row
+    lags: int  # length of the filter's response; 1 without a filter
     rows: int  # rows of an iteration
-    iterations: int  # largest number of iterations of a call
-    stages: tuple[StageShape, ...]
-    delay: int  # rows at the start of a call that hold no data yet
-    reach: int  # samples before, and after, a row's instant on which it depends
 
-    @classmethod
-    def of(cls, stages: Sequence[Stage], chunk: int) -> "LoopShape":
-        """Return the sizes for some stages and about so many samples at once."""
-        factor = math.prod(stage.factor for stage in stages)
-        later_factor = factor
-        shapes = []
-        delay = 0
-        reach = 0
-        for stage in stages:
-            lags = len(stage.response)
-            reach += factor // later_factor * (lags // 2)
-            later_factor //= stage.factor
-            # Later stages must get complete rows.
-            missing_samples = max(0, lags - stage.factor)
-            rows = math.ceil(missing_samples / (stage.factor * later_factor))
-            shapes.append(StageShape(stage.factor, lags, later_factor * rows))
-            delay += rows
-        rows = max(1, round(chunk / factor))
-        samples = rows * factor
-        iterations = max(1, PIECE // samples)
-        return cls(samples, rows, iterations, tuple(shapes), delay, reach)
+    @property
+    def samples(self) -> int:
+        """Samples of an iteration."""
+        return self.rows * self.step
+
+    @property
+    def iterations(self) -> int:
+        """Largest number of iterations of a call."""
+        return max(1, PIECE // self.samples)
+
+    @property
+    def delay(self) -> int:
+        """Rows at the start of a call that hold no data yet."""
+        return math.ceil(max(0, self.lags - self.step) / self.step)
+
+    @property
+    def reach(self) -> int:
+        """Samples before, and after, a row's instant on which it depends."""
+        return self.lags // 2
 
 
 class Piece(NamedTuple):
@@ -178,18 +147,19 @@ class _Stream:
     def __init__(
         self, base: BaseParameters, observations: Observations, edges: Sequence[int]
     ):
-        stages = _stages(observations)
+        response = filter_response(observations)
+        step = observations.decimation.step
         self._stride = 1
-        if all(len(stage.response) == 1 for stage in stages):
-            # Without filters the samples between the rows are not needed.
-            self._stride = math.prod(stage.factor for stage in stages)
-            stages = []
+        if len(response) == 1:
+            # Without a filter the samples between the rows are not needed.
+            self._stride = step
+            step = 1
         self._base = base
         self._observations = observations
         self._edges = list(edges)
         self._mask = np.asarray(observations.mask)
-        self._shape = LoopShape.of(stages, CHUNK)
-        self._matrices = [_banded_matrix(stage) for stage in stages]
+        self._shape = LoopShape(step, len(response), max(1, round(CHUNK / step)))
+        self._matrix = _banded_matrix(response, step)
         program = program_of(base, base.columns, *base.model.input_shapes)
         self._loop = _compile_loop(program, tuple(base.acting_columns), self._shape)
         self._pieces: list[Piece] = []
@@ -203,13 +173,13 @@ class _Stream:
         reach = self._shape.reach
         start, stop = recording.segments[segment]
         first_row, end_row = recording.row_segments[segment]
-        factor = recording.decimation.factor
+        step = recording.decimation.step
         edge = recording.filter.edge(recording.sample_time)
         # A row must be so far from the ends of what the filter has left.
-        distance = max(reach - edge, recording.decimation.memory(), 0)
-        first_inner_row = first_row + math.ceil(distance / factor)
+        distance = max(reach - edge, 0)
+        first_inner_row = first_row + math.ceil(distance / step)
         samples = stop - start - 2 * edge - distance
-        end_inner_row = min(first_row + math.ceil(samples / factor), end_row)
+        end_inner_row = min(first_row + math.ceil(samples / step), end_row)
         call_rows = self._shape.iterations * self._shape.rows
         max_rows = call_rows - self._shape.delay
         # The first sample on which row zero of the segment depends.
@@ -219,7 +189,7 @@ class _Stream:
         ):
             for row in range(rows.start, rows.stop, max_rows):
                 next_row = min(row + max_rows, rows.stop)
-                begin = origin + (row - first_row) * factor
+                begin = origin + (row - first_row) * step
                 end = min(begin + self._samples_of(next_row - row), stop)
                 samples_of_rows = slice(begin, end, self._stride)
                 yield Piece(block, slice(row, next_row), samples_of_rows)
@@ -327,15 +297,15 @@ class _Stream:
         """Return the Gram matrices of a piece."""
         cpu = jax.local_devices(backend="cpu")[0]
         with double_precision(), jax.default_device(cpu):
-            return [np.asarray(G) for G in self._loop(*arrays, mixing, self._matrices)]
+            return [np.asarray(G) for G in self._loop(*arrays, mixing, self._matrix)]
 
 
-def _banded_matrix(stage: Stage) -> Matrix:
+def _banded_matrix(response: Vector, step: int) -> Matrix:
     """Return the matrix that makes the rows of a tile of consecutive samples."""
     rows = []
     for k in range(TILE):
-        margins = k * stage.factor, (TILE - 1 - k) * stage.factor
-        rows.append(np.pad(stage.response, margins))
+        margins = k * step, (TILE - 1 - k) * step
+        rows.append(np.pad(response, margins))
     return np.stack(rows)
 
 
@@ -438,9 +408,9 @@ def _compile_loop(
             columns.append(jnp.broadcast_to(column, motion.shape[1:]))
         return columns + list(forces)
 
-    def run(motion, forces, mask, count, mixing, matrices):
+    def run(motion, forces, mask, count, mixing, matrix):
         def iteration(k: Array, state: tuple) -> tuple:
-            tails, grams = state
+            tail, grams = state
             motion_part = _iteration_part(motion, k, shape.samples)
             forces_part = _iteration_part(forces, k, shape.samples)
             # Results of a branch are stored: no consumer computes them again.
@@ -448,28 +418,26 @@ def _compile_loop(
                 count > 0, evaluate, lambda *_: zeros, motion_part, forces_part
             )
             rows = jnp.stack(columns)
-            next_tails = []
-            for tail, matrix, stage in zip(tails, matrices, shape.stages, strict=True):
+            if shape.lags > 1:
                 samples = jnp.concatenate([tail, rows], axis=1)
-                next_tails.append(samples[:, rows.shape[1] :])
-                count_of_rows = rows.shape[1] // stage.factor
-                rows = _filter_and_decimate(samples, matrix, stage, count_of_rows)
+                tail = samples[:, shape.samples :]
+                rows = _filtered_rows(samples, matrix, shape)
             weights = _iteration_part(mask, k, shape.rows).astype(rows.dtype)
             sums = []
             for gram, mix, places, weight in zip(
                 grams, mixing, distinct_columns.places, weights, strict=True
             ):
                 joint_rows = rows[places]
-                if not tails:
-                    # Without stages the columns are taken before they are stored.
+                if shape.lags == 1:
+                    # Without a filter the columns are taken before they are stored.
                     joint_rows = jnp.stack([columns[i] for i in places])
                 mixed_rows = mix.T @ (joint_rows * weight[None])
                 sums.append(gram + mixed_rows @ mixed_rows.T)
-            return next_tails, sums
+            return tail, sums
 
-        tails = [jnp.zeros((height, x.delay * x.factor)) for x in shape.stages]
+        tail = jnp.zeros((height, shape.delay * shape.step))
         grams = [jnp.zeros((len(x), len(x))) for x in distinct_columns.places]
-        return jax.lax.fori_loop(0, count, iteration, (tails, grams))[1]
+        return jax.lax.fori_loop(0, count, iteration, (tail, grams))[1]
 
     return jax.jit(run, compiler_options=kernel_options(program))
 
@@ -480,15 +448,13 @@ def _iteration_part(x: AnyArray, k: Array, length: int) -> Array:
     return jax.lax.dynamic_slice(x, start, (length, x.shape[1])).T
 
 
-def _filter_and_decimate(
-    samples: Array, matrix: Array, stage: StageShape, rows: int
-) -> Array:
-    """Return rows of samples by a banded matrix product, tile by tile."""
+def _filtered_rows(samples: Array, matrix: Array, shape: LoopShape) -> Array:
+    """Return the rows of an iteration by a banded matrix product, tile by tile."""
     tiles = []
-    for row in range(0, rows, TILE):
-        height = min(TILE, rows - row)
-        width = (height - 1) * stage.factor + stage.lags
-        start = row * stage.factor
+    for row in range(0, shape.rows, TILE):
+        height = min(TILE, shape.rows - row)
+        width = (height - 1) * shape.step + shape.lags
+        start = row * shape.step
         window = samples[:, start : start + width]
         tiles.append(window @ matrix[:height, :width].T)
     return jnp.concatenate(tiles, axis=1)

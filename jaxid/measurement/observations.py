@@ -23,7 +23,8 @@ from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
 
-from .filters import AbstractDecimation, AbstractFilter, Subsample, ZeroPhaseButterworth
+from .filters import AbstractFilter, Subsample, ZeroPhaseButterworth
+from .filters.filter import EVERY_SAMPLE
 from .floating_base import contact_grid, contact_mask, floating_samples
 from .force_sensors import (
     measured_joints,
@@ -62,7 +63,7 @@ class Observations(eqx.Module):
     Attributes:
         source: Motion and forces of the samples.
         filter: Filter of forces and columns.
-        decimation: Decimation of forces and columns.
+        decimation: Samples that become rows of forces and columns.
         segments: Half-open ranges of samples without gaps.
         start_times: Time of the first sample of each segment [s].
         mask: Rows that count, for each joint.
@@ -73,7 +74,7 @@ class Observations(eqx.Module):
 
     source: AbstractSamples
     filter: AbstractFilter
-    decimation: AbstractDecimation
+    decimation: Subsample
     segments: Ranges = eqx.field(static=True)
     start_times: tuple[float, ...] = eqx.field(static=True)
     mask: Bool[AnyArray, "rows joints"]
@@ -91,7 +92,7 @@ class Observations(eqx.Module):
         *,
         sample_time: float | int,
         filter: AbstractFilter | None = None,
-        decimation: AbstractDecimation | None = None,
+        decimation: Subsample = EVERY_SAMPLE,
         segments: Sequence[Range] | None = None,
         mask: ArrayLike | None = None,
         name: str = "observations",
@@ -107,7 +108,7 @@ class Observations(eqx.Module):
             forces: Generalised forces [N m or N].
             sample_time: Time between two samples [s].
             filter: Filter of forces and columns; neither is filtered if None.
-            decimation: Decimation of forces and columns; every sample is a row if None.
+            decimation: Samples that become rows; by default every sample.
             segments: Half-open ranges of samples without gaps; one segment if None.
             mask: Rows that count (rows x joints); all if None.
             name: Name of the observations.
@@ -123,9 +124,8 @@ class Observations(eqx.Module):
         }
         dt = positive_time(sample_time)
         filter = ZeroPhaseButterworth(math.inf) if filter is None else filter
-        decimation = Subsample(1) if decimation is None else decimation
         segments = ((0, len(data["q"])),) if segments is None else tuple(segments)
-        row_samples = _row_samples(segments, filter.edge(dt), decimation.factor)
+        row_samples = _row_samples(segments, filter.edge(dt), decimation.step)
         mask_shape = (sum(map(len, row_samples)), shape[1])
         mask = np.ones(mask_shape, bool) if mask is None else np.asarray(mask, bool)
         if mask.shape != mask_shape:
@@ -194,7 +194,7 @@ class Observations(eqx.Module):
     @property
     def row_time(self) -> float:
         """Time between two rows [s]."""
-        return self.sample_time * self.decimation.factor
+        return self.sample_time * self.decimation.step
 
     @property
     def row_segments(self) -> Ranges:
@@ -209,7 +209,7 @@ class Observations(eqx.Module):
 
     def _row_samples(self) -> list[range]:
         edge = self.filter.edge(self.sample_time)
-        return _row_samples(self.segments, edge, self.decimation.factor)
+        return _row_samples(self.segments, edge, self.decimation.step)
 
     def _times(self, samples: Sequence[range]) -> Vector:
         """Return the times of samples of each segment [s]."""
@@ -228,8 +228,8 @@ class Observations(eqx.Module):
         samples = self.instants[rows]
         first_sample = int(samples[0])
         last_sample = int(samples[-1])
-        factor = self.decimation.factor
-        motion, _ = self.read(slice(first_sample, last_sample + 1, factor))
+        step = self.decimation.step
+        motion, _ = self.read(slice(first_sample, last_sample + 1, step))
         return motion
 
     def reduce(self, x: Float[AnyArray, "samples *columns"]) -> np.ndarray:
@@ -243,13 +243,13 @@ class Observations(eqx.Module):
         parts = []
         for a, b in self.segments:
             inner_samples = slice(edge, b - a - edge)
-            parts.append(self._reduce(inner_samples, slice(None), x[a:b]))
+            parts.append(self._reduce(inner_samples, x[a:b]))
         return np.concatenate(parts)
 
-    def _reduce(self, samples: slice, rows: slice, x: AnyArray) -> np.ndarray:
-        """Smooth, take the samples between the edges, decimate, and take some rows."""
+    def _reduce(self, samples: slice, x: AnyArray) -> np.ndarray:
+        """Smooth, and take the rows among the samples between the edges."""
         smooth_samples = self.filter.smooth(x, self.sample_time)
-        return self.decimation(smooth_samples[samples])[rows]
+        return smooth_samples[samples][:: self.decimation.step]
 
     def chunks(
         self, samples: int = 16384, row_ranges: Sequence[Range] | None = None
@@ -267,11 +267,10 @@ class Observations(eqx.Module):
         overlap = Overlap(
             edge=self.filter.edge(self.sample_time),
             smoothing=self.filter.low_pass(self.sample_time).memory(),
-            decimation=self.decimation.memory(),
-            factor=self.decimation.factor,
+            step=self.decimation.step,
         )
         reduce = self._reduce
-        step = max(1, samples // overlap.factor)
+        step = max(1, samples // overlap.step)
         chunks = []
         for segment, segment_rows in zip(self.segments, self.row_segments, strict=True):
             first_row, end_row = segment_rows
@@ -337,7 +336,7 @@ def observe(
     recording: Recording,
     robot: Robot,
     filter: AbstractFilter,
-    decimation: AbstractDecimation | None = None,
+    decimation: Subsample = EVERY_SAMPLE,
     min_speed: Numbers | None = None,
     name: str | None = None,
 ) -> Observations:
@@ -348,7 +347,7 @@ def observe(
         robot: Robot, whose drives convert from motors to joints where the recording
             needs it.
         filter: Filter of the motion, and of forces and columns.
-        decimation: Decimation of forces and columns; every sample is a row if None.
+        decimation: Samples that become rows; by default every sample.
         min_speed: Speed of each joint below which its rows do not count [rad/s or m/s],
             since stiction is not in the model.
         name: Name of the observations; the recording's if None.
@@ -419,7 +418,7 @@ def prepare(
     has_velocities: bool,
     robot: Robot,
     filter: AbstractFilter,
-    decimation: AbstractDecimation | None,
+    decimation: Subsample,
     min_speed: Numbers | None,
     name: str,
     progress: Progress | None = None,
@@ -435,14 +434,13 @@ def prepare(
             f"{robot.joints - virtual}: choose the columns of its joints, or the robot "
             "of this log."
         )
-    decimation = Subsample(1) if decimation is None else decimation
     dt = grid.sample_time
     try:
         decimation.check(filter.low_pass(dt).cutoff, dt)
         edge = filter.edge(dt)
     except InputError as error:
         raise InputError(f"`{name}`: {error}") from error
-    grid = usable_segments(grid, edge, decimation.factor, name)
+    grid = usable_segments(grid, edge, decimation.step, name)
     notes = grid.notes
     if has_velocities and not filter.uses_velocities:
         kind = type(filter).__name__
@@ -450,7 +448,7 @@ def prepare(
             f"the measured velocities are not used: `{kind}` takes them from the angles"
         )
         notes = (*notes, note)
-    rows = sum(map(len, _row_samples(grid.segments, edge, decimation.factor)))
+    rows = sum(map(len, _row_samples(grid.segments, edge, decimation.step)))
     observations = Observations(
         source=load(grid.segments),
         filter=filter,

@@ -15,7 +15,8 @@ from jaxid.result_table import printable
 from jaxid.robot.robot import Robot
 
 from .columns import Columns, Log, open_log
-from .filters import AbstractDecimation, AbstractFilter
+from .filters import AbstractFilter, Subsample
+from .filters.filter import EVERY_SAMPLE
 from .log_files import COMMENT, NO_NUMBER, Complaints, LogTable
 from .observations import Observations, Progress, prepare
 from .recording import MIN_SAMPLES, Recording, consecutive
@@ -303,7 +304,7 @@ def scan_log(
     columns: Columns,
     robot: Robot,
     filter: AbstractFilter,
-    decimation: AbstractDecimation | None = None,
+    decimation: Subsample = EVERY_SAMPLE,
     min_speed: Numbers | None = None,
     name: str | None = None,
     *,
@@ -325,7 +326,7 @@ def scan_log(
         columns: Meaning of the columns.
         robot: Robot, whose drives convert from motors to joints.
         filter: Filter of the motion, and of forces and columns, with a finite memory.
-        decimation: Decimation of forces and columns; every sample is a row if None.
+        decimation: Samples that become rows; by default every sample.
         min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
         name: Name of the log; the file's if None.
         forces_path: File with the forces.

@@ -2,7 +2,6 @@
 
 import abc
 import functools
-import math
 from collections.abc import Callable, Iterable
 from typing import Any, NamedTuple
 
@@ -61,8 +60,7 @@ class Overlap(NamedTuple):
 
     edge: int  # samples to drop at both ends of a segment
     smoothing: int  # memory of the filter of columns
-    decimation: int  # memory of the filters of the decimation
-    factor: int  # samples for each row
+    step: int  # samples for each row
 
     def chunk(
         self,
@@ -77,28 +75,16 @@ class Overlap(NamedTuple):
             segment: Samples of the segment.
             first_row: First row of the segment.
             rows: Rows.
-            reduce: Function of the samples between the edges, the rows among them, and
-                columns that returns the rows.
+            reduce: Function of the samples between the edges, and columns, that returns
+                the rows.
         """
         first_sample = segment[0] + self.edge
-        end_sample = segment[1] - self.edge
-        start = rows[0] - first_row
-        stop = rows[1] - first_row
-        # Decimation keeps its phase: its first input sample is a row.
-        extra_rows = math.ceil(self.decimation / self.factor)
-        input_row = max(0, start - extra_rows)
-        outputs = slice(start - input_row, stop - input_row)
-
-        # Samples of the decimation, then those of the filter before it.
-        input_start = first_sample + input_row * self.factor
-        last_sample = first_sample + (stop - 1) * self.factor
-        input_end = min(end_sample, last_sample + self.decimation + 1)
-        begin = max(segment[0], input_start - self.smoothing)
-        end = min(segment[1], input_end + self.smoothing)
-        inputs = slice(input_start - begin, input_end - begin)
-
-        reduce_part = functools.partial(reduce, inputs, outputs)
-        return Chunk((begin, end), rows, reduce_part)
+        start = first_sample + (rows[0] - first_row) * self.step
+        stop = first_sample + (rows[1] - 1 - first_row) * self.step + 1
+        begin = max(segment[0], start - self.smoothing)
+        end = min(segment[1], stop + self.smoothing)
+        samples = slice(start - begin, stop - begin)
+        return Chunk((begin, end), rows, functools.partial(reduce, samples))
 
 
 def joined(parts: Iterable[Any]) -> Any:

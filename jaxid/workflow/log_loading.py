@@ -264,7 +264,7 @@ def select_filter(
         setup.filter_candidates,
         estimator=setup.unbounded_estimator,
         min_speed=setup.min_speed,
-        row_step=setup.decimation.factor,
+        row_step=setup.decimation.step,
         progress=partial(progress, "choosing the filter"),
     )
     return dataclasses.replace(

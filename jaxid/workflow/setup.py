@@ -43,7 +43,6 @@ from jaxid.identification.identify import fit_problem
 from jaxid.identification.problem import RegressionProblem
 from jaxid.identification.uncertainty import AbstractUncertainty, SpectralSandwich
 from jaxid.measurement.filters import (
-    AbstractDecimation,
     AbstractFilter,
     Subsample,
 )
@@ -137,7 +136,7 @@ class Setup(eqx.Module):
         filter_candidates: Filters of which the logs choose one instead of the first of
             them; none where another `filter` is given, by default those of
             `choose_filter`.
-        decimation: Decimation of forces and columns.
+        decimation: Samples that become rows of forces and columns.
         min_speed: Speed of each joint below which its rows do not count [rad/s or m/s].
         estimator: Estimator; by default weighted least squares over bodies that can
             exist, pulled towards those of the robot's file as far as the logs bear.
@@ -156,7 +155,7 @@ class Setup(eqx.Module):
     _: dataclasses.KW_ONLY
     filter: AbstractFilter = eqx.field(default=None)
     filter_candidates: tuple[AbstractFilter, ...] = ()
-    decimation: AbstractDecimation = Subsample(1)
+    decimation: Subsample = Subsample()
     min_speed: Float[AnyArray, " joints"] | Sequence[float] | None = None
     estimator: AbstractEstimator = eqx.field(default=None)
     least_squares: LeastSquares | WeightedLeastSquares = eqx.field(default=None)

@@ -114,7 +114,7 @@ def test_arrays_and_other_files(base, numbers, parquet, tmp_path):
 @pytest.mark.parametrize("filter", FILTERS)
 def test_a_part_is_filtered_like_the_whole(base, parquet, filter):
     log = scan_log(parquet, COLUMNS, base.model.robot, filter)
-    whole = in_memory(base, parquet, None, filter).motion
+    whole = in_memory(base, parquet, jid.Subsample(), filter).motion
     for a, b in ((0, 500), (7000, 9000), (SAMPLES - 300, SAMPLES)):
         part, _ = log.read(slice(a, b))
         np.testing.assert_allclose(part.q, whole.q[a:b], atol=1e-13)

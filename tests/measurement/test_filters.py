@@ -11,7 +11,6 @@ from scipy import signal
 from jaxid.measurement import filters
 from jaxid.measurement.filters import (
     AbstractFilter,
-    Decimation,
     PaperFilter,
     PeriodicFourier,
     Subsample,
@@ -256,21 +255,8 @@ def periodic(periods, harmonics):
         (lambda: PeriodicFourier(np.inf, 5).edge(DT), "`10 harmonics / period`"),
         (lambda: PeriodicFourier(1.0, 2.5), "`harmonics`"),
         (lambda: Subsample(0), "`step`"),
-        (lambda: Decimation((10, 20)), "`factors`"),
     ],
 )
 def test_refusals(make, complaint):
     with pytest.raises(ValueError, match=complaint):
         make()
-
-
-def test_decimation_is_scipys_with_gain_one():
-    x = np.random.default_rng(2).normal(size=(3000, 2, 2)).cumsum(axis=0)
-    expected = signal.decimate(signal.decimate(x, 10, axis=0), 5, axis=0)
-    # Scipy runs sections or coefficients, and pads them otherwise, depending on its
-    # version.
-    got = Decimation((10, 5))(x) * 10 ** (-0.05 / 20 * 4)
-    assert got.shape == (60, 2, 2)
-    np.testing.assert_allclose(got[8:-8], expected[8:-8], atol=1e-2 * np.abs(x).max())
-    np.testing.assert_allclose(Decimation((10, 5))(np.full(3000, 2.0)), 2.0, rtol=1e-9)
-    np.testing.assert_array_equal(Subsample(7)(x), x[::7])

@@ -117,7 +117,7 @@ def rescale_covariance(covariance: BaseMatrix, deviations: BaseVector) -> BaseMa
 
 
 class ResidualSpectra(eqx.Module):
-    """Spectra of the residuals of each joint, after filters and decimation.
+    """Spectra of the residuals of each joint, after the filter.
 
     Whiteness is judged within the band of the filters, with their gain and the leverage
     of the fit divided out: the cumulative periodogram is compared with a straight line
@@ -126,7 +126,7 @@ class ResidualSpectra(eqx.Module):
     Attributes:
         frequency: Frequencies of the lines [Hz].
         density: Smoothed power of each joint [N² m²/Hz or N²/Hz].
-        gain: Gain (0 to 1) of filter and decimation at each line.
+        gain: Gain (0 to 1) of the filter at each line.
         departure: Largest distance (0 to 1) of the cumulative periodogram from a
             straight line.
         limit: Departure that white residuals exceed once in twenty.

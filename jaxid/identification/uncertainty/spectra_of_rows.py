@@ -63,7 +63,7 @@ class Lines:
         row_time: Time between two rows [s].
         frequency: Frequencies of the lines [Hz].
         multiplicity: Number of times that each line counts.
-        gain: Gain (0 to 1) of filter and decimation at each line.
+        gain: Gain (0 to 1) of the filter at each line.
         bins: Bin of each line.
         energy: Sums of `ChannelSpectra.energy` [base, channels, lines].
         leverage: Sums of `ChannelSpectra.leverage` [channels, lines].
@@ -229,7 +229,7 @@ def divide_into_stretches(problem: RegressionProblem):
     max_rows = MAX_ROWS if is_complete else MAX_ROWS // 4
     stretches = []
     for number, recording in enumerate(problem.recordings):
-        max_length = 4 * max_rows // recording.decimation.factor
+        max_length = 4 * max_rows // recording.decimation.step
         length = max(4, min(max_rows, max_length))
         for start, stop in recording.row_segments:
             # Equal lengths have fast transforms; all rows must be in a stretch.
@@ -289,16 +289,10 @@ def _rows_of_stretches(
 
 
 def _visible_lines(recording: Observations, length: int):
-    """Return frequencies [Hz] and gains of lines that filter and decimation pass."""
+    """Return frequencies [Hz] and gains of the lines that the filter passes."""
     frequency = scipy.fft.rfftfreq(length, recording.row_time)
-    sample_time = recording.sample_time
-    decimation = recording.decimation
-    low_pass = recording.filter.low_pass(sample_time)
-    gain = low_pass.gain(frequency, sample_time)
-    for k, factor in enumerate(decimation.stages):
-        low_pass = decimation.low_pass(k)
-        gain = gain * low_pass.gain(frequency, sample_time)
-        sample_time *= factor
+    low_pass = recording.filter.low_pass(recording.sample_time)
+    gain = low_pass.gain(frequency, recording.sample_time)
     # Lines with less gain carry no information.
     count = int(np.flatnonzero(gain > 1e-3)[-1]) + 1
     return frequency[:count], gain[:count]

@@ -1,11 +1,6 @@
-"""Filters: motion from measured angles, low-pass for forces and columns, decimation."""
+"""Filters: motion from measured angles, low-pass for forces and columns, rows."""
 
-from .decimation import (
-    AbstractDecimation as AbstractDecimation,
-    Decimation as Decimation,
-    Subsample as Subsample,
-)
-from .filter import AbstractFilter as AbstractFilter
+from .filter import AbstractFilter as AbstractFilter, Subsample as Subsample
 from .low_pass import LowPass as LowPass
 from .motion_filters import (
     PaperFilter as PaperFilter,

@@ -1,4 +1,4 @@
-"""The two sides that every filter has, and the checks of its settings.
+"""The two sides that every filter has, the checks of its settings, and the rows.
 
 A regressor's columns are not band-limited (friction has edges), so the columns must be
 filtered like the forces, or parameters that are coupled with friction are biased. Hence
@@ -7,6 +7,7 @@ forces and columns.
 """
 
 import abc
+import math
 from collections.abc import Callable
 from typing import ClassVar
 
@@ -109,3 +110,35 @@ def require(
     if value is not None and not is_valid(value):
         owner = type(filter).__name__
         raise InputError(f"`{name}` of `{owner}` must be {words}, but is {value:g}.")
+
+
+class Subsample(eqx.Module):
+    """Every n-th sample becomes a row; the filter must leave less than half that rate.
+
+    Attributes:
+        step: Number of samples for each row.
+    """
+
+    step: int = eqx.field(static=True, converter=integer("step"), default=1)
+
+    def __check_init__(self) -> None:
+        if self.step < 1:
+            raise InputError(
+                f"`step` must be a whole number from 1 on, but is {self.step}."
+            )
+
+    def check(self, cutoff: float, sample_time: float) -> None:
+        """Refuse a signal of band `cutoff` [Hz] that would be aliased."""
+        rate = 1.0 / (sample_time * self.step)
+        if self.step == 1 or cutoff <= 0.5 * rate:
+            return
+        max_step = max(1, math.floor(0.5 / (cutoff * sample_time)))
+        raise InputError(
+            f"`Subsample({self.step})` leaves {rate:.6g} Hz, but a cut-off of "
+            f"{cutoff:.6g} Hz needs more than {2 * cutoff:.6g} Hz: use a step of at "
+            f"most {max_step} samples, or a lower `force_cutoff`."
+        )
+
+
+EVERY_SAMPLE = Subsample()
+"""No sample is left out."""

@@ -47,7 +47,7 @@ class ZeroPhaseButterworth(AbstractFilter):
             [Hz], like `10.0`.
         order: Order of one pass.
         force_cutoff: Cut-off of forces and columns [Hz], like `20.0`; `cutoff` if None;
-            infinite if decimation alone should limit their band.
+            infinite for none.
         margin: Time to drop at both ends of a segment [s], like `0.1`; until the filter
             has settled if None.
     """
