@@ -98,6 +98,7 @@ KEYS: dict[str, TomlTable] = {
         "rotation": Vector,
         "position": Vector,
         "in_ground": bool,
+        "under_base": bool,
     },
     "limits": {
         "angle_unit": ANGLE_UNIT,

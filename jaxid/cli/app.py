@@ -212,10 +212,8 @@ def inspect(
         inspection = jid.workflow.Inspection(content.setup)
         files = []
         if logs:
-            columns = content.require_columns(logs)
-            inspection = jid.workflow.inspect_logs(
-                content.setup, logs, columns, progress
-            )
+            setup, columns = content.identification(logs)
+            inspection = jid.workflow.inspect_logs(setup, logs, columns, progress)
             progress("writing the report", 0.0)
             files = inspection.save(output, options.report_origin(content.text))
     terminal.show_result(console, detail, inspection, output, files)
@@ -254,10 +252,10 @@ def identify(
     )
     held_out = None if split is None else 1.0 - split
     content = jid.experiment.load_experiment(experiment)
-    columns = content.require_columns([*logs, *unseen_logs])
+    setup, columns = content.identification([*logs, *unseen_logs])
     with terminal.progress_bar() as progress:
         report = jid.identify_logs(
-            content.setup, logs, columns, held_out, unseen_logs, progress
+            setup, logs, columns, held_out, unseen_logs, progress
         )
         settings = {
             "experiment": str(experiment),

@@ -74,7 +74,7 @@ class Experiment:
     columns: Columns | None  # columns of the logs; None if the file does not say
     # known load that is on the robot in some logs only; None if the file does not say
     load: Tool | float | None
-    # force sensor at the end-effector; None if the file does not say
+    # force sensor at the end-effector or under the base; None if the file does not say
     sensor: ForceSensor | None
     # settings of simulations that follow commands, or torques
     rollout: ServoSettings | TorqueSettings
@@ -104,6 +104,19 @@ class Experiment:
             f"{self.path.name}: the table `[recording]` "
             f"is missing: it names {description}."
         )
+
+    def identification(self, logs: Sequence[Path]) -> tuple[Setup, Columns]:
+        """Return how logs become parameters, with the sensor under the base.
+
+        Raises:
+            InputError: If the file does not describe the columns of the logs.
+        """
+        columns = self.require_columns(logs)
+        if self.sensor is None or not self.sensor.under_base:
+            return self.setup, columns
+        with within("sensor", self.path.name):
+            setup = self.sensor.beside(self.setup, columns)
+        return setup, self.sensor.columns(columns)
 
 
 def load_experiment(path: FilePath) -> Experiment:

@@ -19,6 +19,7 @@ from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_angles
 from jaxid.robot.urdf import load_urdf
 from jaxid.robot.urdf_tree import UrdfTree, link_names
+from jaxid.robot.virtual_joints import GROUP
 
 from .bodies_and_joint_dynamics import (
     JointDynamics,
@@ -74,12 +75,16 @@ def export_urdf(
     place = {"tip": tip, "base": base, "xacro_arguments": arguments}
     place["floating"] = robot.floating
     file_robot = load_urdf(source, **place)
+    # Joints of a sensor under the base are not in the file.
+    first = GROUP if robot.has_base_sensor else 0
+    if first:
+        file_robot = file_robot.with_sensor(under_base=True)
     _require_same_robot(robot, file_robot, source)
     tree = UrdfTree(source, **place)
     dynamics = joint_dynamics(fit)
     _replace_comment(tree.root, fit, (*dynamics.rotors, *dynamics.omissions))
-    _replace_inertials(tree, bodies)
-    _write_joints(tree, robot, dynamics)
+    _replace_inertials(tree, bodies[first:])
+    _write_joints(tree, robot, dynamics, first)
     document = tree.root.getroottree()
     text = etree.tostring(document, xml_declaration=True, encoding="utf-8")
     write_bytes(path, text + b"\n")
@@ -160,13 +165,15 @@ def _fix_joint(tree: UrdfTree, joint: Any) -> None:
     origin.attrib.pop("quat_xyzw", None)  # another form of the same
 
 
-def _write_joints(tree: UrdfTree, robot: Robot, dynamics: JointDynamics) -> None:
-    """Write the friction and the largest forces of the joints that the robot has."""
+def _write_joints(
+    tree: UrdfTree, robot: Robot, dynamics: JointDynamics, first: int
+) -> None:
+    """Write friction and largest forces of the robot's joints from the first one on."""
     # That of followers is part of their leaders'.
     zeros = np.zeros(len(robot.followers))
-    damping = np.append(dynamics.values["damping"], zeros)
-    friction = np.append(dynamics.values["friction"], zeros)
-    efforts = np.append(robot.known_max_forces, zeros + np.inf)
+    damping = np.append(dynamics.values["damping"][first:], zeros)
+    friction = np.append(dynamics.values["friction"][first:], zeros)
+    efforts = np.append(robot.known_max_forces[first:], zeros + np.inf)
     for i, joint in enumerate(tree.joints):
         element = child_element(joint, "dynamics")
         element.set("damping", exact_text(damping[i]))
@@ -200,7 +207,8 @@ def _require_same_robot(robot: Robot, file_robot: Robot, source: FilePath) -> No
                 f"joint `{name}` {words} in `{source}`, but not in the robot of the "
                 "fit: give the file of that robot."
             )
-    is_on_body = np.array(robot.parent) >= 0
+    # How the robot is mounted on a sensor is not in the file, either.
+    is_on_body = np.array(robot.parent) >= (GROUP if robot.has_base_sensor else 0)
     for quantity in ("axis", "rotation", "offset"):
         fit_numbers = np.asarray(getattr(robot, quantity))
         file_numbers = np.asarray(getattr(file_robot, quantity))

@@ -16,6 +16,7 @@ from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.joint_coordinates import with_leader
 from jaxid.robot.mjcf import exact_text
 from jaxid.robot.robot import GRAVITY, Robot
+from jaxid.robot.virtual_joints import GROUP, frames_between
 
 from .bodies_and_joint_dynamics import (
     Quantities,
@@ -95,14 +96,17 @@ def mjcf_text(
 
     elements: dict[int, Any] = {-1: world}
     for i in robot.order:
-        if i not in robot.solid_bodies:
+        if i in frames_between(robot.virtual):
             elements[i] = elements[robot.parent[i]]
             continue
+        # The first joint of a group holds its placement.
+        placed = i - GROUP + 1 if i in robot.virtual else i
+        is_solid = i in robot.solid_bodies
         body = E.body(
-            _inertial(np.asarray(bodies)[i]),
+            *([_inertial(np.asarray(bodies)[i])] if is_solid else []),
             *_joints(robot, i, dynamics),
             name=f"{robot.body_names[i]}_body",
-            **placement_attributes(robot.offset[i], robot.rotation[i]),
+            **placement_attributes(robot.offset[placed], robot.rotation[placed]),
         )
         elements[robot.parent[i]].append(body)
         elements[i] = body

@@ -25,7 +25,8 @@ def refuse_missing_wrench(recording: Recording, robot: Robot) -> None:
             f"`wrench` of `{recording.name}` must have {len(robot.rigid)} columns, six "
             f"for each force sensor of `{robot.name}`, but has {columns}: name the "
             "columns, or describe the sensor by `robot.with_sensor()`; of the commands "
-            "only `jaxid payload` uses `[sensor]`."
+            "only `jaxid payload` uses `[sensor]`, and with `under_base = true` only "
+            "`jaxid identify` and `jaxid inspect`."
         )
     if wrench is not None and columns and not np.ptp(wrench, axis=0).any():
         raise InputError(

@@ -304,8 +304,9 @@ class Observations(eqx.Module):
         mask = np.asarray(self.mask)
         first_part = self.replace(mask=mask & is_early)
         second_part = self.replace(mask=mask & ~is_early)
+        has_rows = mask.any(axis=0)
         for part in (first_part, second_part):
-            if not part.mask.any(axis=0).all():
+            if (has_rows & ~part.mask.any(axis=0)).any():
                 raise InputError(
                     f"`fraction` of {fraction:g} leaves no rows of some joint of "
                     f"`{self.name}`: validate with another log (`--verify`)."

@@ -83,18 +83,19 @@ def log_figure(robot: Robot, log: Recording) -> Figure:
     forces = np.asarray(robot.known_max_forces)
     panels = []
     for j in range(robot.joints):
-        force = Curve(log.time, np.asarray(log.forces)[:, j], "force", ORANGE)
         angle = Curve(log.time, np.asarray(log.angles)[:, j], "position", BLUE)
-        force_panel = Panel(
-            [force], unit=robot.force_unit(j), levels=_lines(-forces[j], forces[j])
-        )
+        below = []
+        if log.forces is not None:
+            force = Curve(log.time, np.asarray(log.forces)[:, j], "force", ORANGE)
+            levels = _lines(-forces[j], forces[j])
+            below = [Panel([force], unit=robot.force_unit(j), levels=levels)]
         panels.append(
             Panel(
                 [angle],
                 title=robot.joint_names[j],
                 unit=robot.joint_unit(j),
                 levels=_lines(limits.position_min[j], limits.position_max[j]),
-                below=[force_panel],
+                below=below,
             )
         )
     title = f"{log.name}: positions and forces (dashed: limits)"

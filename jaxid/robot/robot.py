@@ -35,7 +35,7 @@ from .rotations import (
     snapped_rotations,
     unit_axes,
 )
-from .virtual_joints import GROUP, numbers_of_bodies, with_sensor
+from .virtual_joints import GROUP, numbers_of_bodies, solid_bodies, with_sensor
 
 GRAVITY = (0.0, 0.0, -9.81)
 
@@ -257,10 +257,14 @@ class Robot(Summarised, Hashable):
         return self.rigid[GROUP - 1 :: GROUP]
 
     @property
+    def has_base_sensor(self) -> bool:
+        """Whether a force sensor is under the base."""
+        return self.virtual[:1] == (0,) and not self.floating
+
+    @property
     def solid_bodies(self) -> tuple[int, ...]:
         """Indices of the bodies that have a mass."""
-        massless = {*self.virtual} - {*self.virtual[GROUP - 1 :: GROUP]}
-        return tuple(i for i in range(self.bodies) if i not in massless)
+        return solid_bodies(self)
 
     @property
     def numbers(self) -> tuple[int, ...]:
@@ -435,8 +439,7 @@ class Robot(Summarised, Hashable):
             under_base: Whether the sensor is under the base.
 
         Raises:
-            InputError: If there is a sensor already, the attitude is no rotation, or
-                the position no point.
+            InputError: If there is a sensor already, or its place is none.
         """
         attitude = np.eye(3) if rotation is None else rotation
         R = as_rotations("`rotation` of the sensor", attitude, (3, 3))

@@ -24,6 +24,22 @@ FORCE_NAMES = ("fx", "fy", "fz", "mx", "my", "mz")
 """Endings of the names of a group's joints: forces along, moments about the axes."""
 
 
+def frames_between(virtual: tuple[int, ...]) -> set[int]:
+    """Return the indices of the bodies between two virtual joints of a group."""
+    return {*virtual} - {*virtual[GROUP - 1 :: GROUP]}
+
+
+def solid_bodies(robot: Any) -> tuple[int, ...]:
+    """Return the indices of the bodies that have a mass.
+
+    A base on a sensor does not move: its gravity is a part of the sensor's bias.
+    """
+    massless = frames_between(robot.virtual)
+    if robot.has_base_sensor:
+        massless.add(GROUP - 1)
+    return tuple(i for i in range(robot.bodies) if i not in massless)
+
+
 def numbers_of_bodies(bodies: int, virtual: tuple[int, ...]) -> tuple[int, ...]:
     """Return for each body the number in names of parameters.
 

@@ -56,6 +56,8 @@ def limited_forces(recording: Recording) -> Iterator[LimitedForce]:
     Many samples lie on the last value then, and few on the three beside it, which
     coarse steps would reach as often.
     """
+    if recording.forces is None:
+        return
     angles = np.asarray(recording.angles)
     for joint, channel in enumerate(np.asarray(recording.forces).T):
         speed = np.abs(np.gradient(angles[:, joint]))

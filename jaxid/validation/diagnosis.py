@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxid.arrays import AnyArray, Indices, Numbers
+from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.identification.delay import Delay
@@ -31,6 +32,7 @@ from .clock import clock_finding, held_forces
 from .limit_checks import LogStatistics, limit_findings
 from .mistake_search import find_mistakes, ignore_progress
 from .sensor_checks import channel_findings, constant_forces, repeated_channels
+from .wrench_checks import base_wrench_remarks
 
 MAX_SAMPLES = 2**17
 """Largest number of samples of a long log that are examined."""
@@ -323,6 +325,20 @@ def mistakes_in_logs(
     )
 
 
+def _mistakes_in_base_wrenches(
+    model: Model, logs: Sequence[Observations]
+) -> LogMistakes:
+    """Return what is wrong with the wrenches of a sensor under the base."""
+    certain = []
+    doubts = []
+    for log in logs:
+        name = f"{log.name}: " if len(logs) > 1 else ""
+        for remark in base_wrench_remarks(model, log):
+            texts = certain if remark.status is Status.BAD else doubts
+            texts.append(f"{name}{remark.text}")
+    return LogMistakes(tuple(certain), tuple(doubts))
+
+
 def _mistakes(
     diagnoses: Sequence[Diagnosis],
     fit: Fit,
@@ -331,6 +347,9 @@ def _mistakes(
 ) -> LogMistakes:
     """Return the mistake that explains most, and what only a model reveals."""
     model = fit.base.model
+    if model.robot.has_base_sensor:
+        logs = [x.observations for x in diagnoses if x.observations is not None]
+        return _mistakes_in_base_wrenches(model, logs)
     if model.robot.virtual:
         return LogMistakes()
     recordings = []

@@ -41,7 +41,7 @@ def _position_and_force_findings(
     """Look for wrapped, spiky and held angles, and for held forces."""
     findings = []
     angles = np.asarray(recording.angles)
-    forces = np.asarray(recording.forces)
+    forces = recording.forces
     time = np.asarray(recording.time)
     segments = recording.segments
     for j, name in enumerate(robot.joint_names):
@@ -52,7 +52,9 @@ def _position_and_force_findings(
         text = text or _held_angle_text(x, other_angles, time, segments)
         if text:
             findings.append((j, f"the angle of {owner} `{name}` {text}"))
-        hold = _held_force_text(forces[:, j], x, time, segments)
+        if forces is None:
+            continue
+        hold = _held_force_text(np.asarray(forces)[:, j], x, time, segments)
         if hold:
             findings.append((j, f"the forces of joint `{name}` {hold}"))
     return findings
@@ -212,6 +214,8 @@ def _hold(value: float, start: float, stop: float) -> str:
 
 def constant_forces(robot: Robot, recording: Recording) -> list[str]:
     """Return a sentence about each joint whose forces are constant."""
+    if recording.forces is None:
+        return []
     forces = np.asarray(recording.forces)
     return [
         f"the forces of joint `{name}` are {channel[0]:.3g} throughout: is it the "
@@ -226,6 +230,8 @@ def repeated_channels(robot: Robot, recording: Recording) -> list[str]:
     texts = []
     channels = {"angles": recording.angles, "forces": recording.forces}
     for quantity, values in channels.items():
+        if values is None:
+            continue
         columns = np.asarray(values).T
         moving_joints = np.flatnonzero(np.ptp(columns, axis=1) > 0)
         texts += [

@@ -417,6 +417,9 @@ def definiteness(fit: Fit, poses: int = POSES) -> Definiteness:
     )
     q = reachable(robot, q)
     M = in_numpy(fit.base, fit.base.inertia, q, shared=(fit.parameters,))
+    if robot.has_base_sensor:
+        # Base parameters describe a base that stands still.
+        M = M[:, robot.driven][:, :, robot.driven]
     min_eigenvalues = np.linalg.eigvalsh(M)[:, 0]
     worst_pose = int(np.argmin(min_eigenvalues))
     return Definiteness(

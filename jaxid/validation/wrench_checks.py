@@ -1,7 +1,9 @@
-"""Wrenches of force sensors against gravity: frame, sign, compensation and taring.
+"""Wrenches of force sensors: frame, sign, order, compensation and taring.
 
-Gravity of a load turns with the sensor. Its forces at many attitudes tell along which
-axes the wrench is written, and whether gravity is in it at all.
+Gravity of a load turns with a sensor at the wrist. Its forces at many attitudes tell
+along which axes the wrench is written, and whether gravity is in it at all. A sensor
+under the base does not turn: there the motion tells, since the bodies of the arm
+explain no wrench along other axes.
 """
 
 from typing import NamedTuple
@@ -17,6 +19,7 @@ from jaxid.measurement.force_sensors import sensor_attitudes
 from jaxid.measurement.observations import Observations
 from jaxid.result_table import Remark, Status, significant
 from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import skew
 from jaxid.robot.virtual_joints import GROUP
 
 Forces = Float[np.ndarray, "rows 3"]
@@ -148,23 +151,10 @@ def _axes_remarks(robot: Robot, gravity: _Gravity) -> list[Remark]:
         )
         remarks.append(Remark(text, Status.BAD))
     if sign < 0:
-        text = (
-            "the wrench has the opposite sign: it is the wrench of the load on the "
-            "sensor. Give `sign = -1` in `[sensor]`, or multiply it by -1."
-        )
-        remarks.append(Remark(text, Status.BAD))
-    rotation = scipy.spatial.transform.Rotation.from_matrix(sign * turn.T)
-    angle = rotation.magnitude()
-    if angle > LIMITS.max_angle:
-        described = scipy.spatial.transform.Rotation.from_matrix(robot.tip_rotation.T)
-        angles = (described * rotation).as_euler("xyz", degrees=True)
-        numbers = ", ".join(f"{x:.0f}" for x in angles)
-        text = (
-            f"the wrench is turned by {significant(np.rad2deg(angle), 2)} degrees "
-            "against its description: gravity says that roll, pitch and yaw of the "
-            f"sensor are about [{numbers}] degrees. Give them as `rotation` in "
-            "`[sensor]`, or turn the wrench."
-        )
+        remarks.append(Remark(OPPOSITE_SIGN, Status.BAD))
+    rotation = sign * turn.T
+    if _angle(rotation) > LIMITS.max_angle:
+        text = _turn_text(np.asarray(robot.tip_rotation).T, rotation, "gravity")
         remarks.append(Remark(text, Status.BAD))
     return remarks
 
@@ -180,3 +170,156 @@ def _taring(forces: Forces, gravity: _Gravity) -> list[Remark]:
         "the load on. The bias takes it into account; the mass is not affected."
     )
     return [Remark(text)]
+
+
+class BaseWrenchLimits(NamedTuple):
+    """When the wrench of a sensor under the base is not the one that is described.
+
+    Set on simulated logs of a Panda, shown on a UR5 and an iiwa.
+    """
+
+    rows: int = 300  # rows of the log that are looked at
+    rank: float = 1e-6  # least singular value of the columns, over the largest one
+    steps: int = 8  # turns from each start
+    tie: float = 1.1  # ratio of what turns leave unexplained that are equally good
+    certain: float = 0.5  # remaining part of the unexplained if another way is right
+    doubtful: float = 0.98  # remaining part if the sensor may be turned a little
+    max_angle: float = np.deg2rad(1.5)  # of a rotation that is not named
+
+
+BASE_LIMITS = BaseWrenchLimits()
+
+
+class _BaseWrench(NamedTuple):
+    """Wrench of a sensor under the base, and what the bodies of the robot explain.
+
+    Attributes:
+        columns: Weighted columns of the parameters.
+        known: Weighted wrench of the known tool.
+        entries: Weighted wrenches along turned axes, one for each entry of the turn.
+        unexplained: What the columns explain neither of the entries nor of the tool's.
+        size: Norm of the weighted wrench without its mean.
+    """
+
+    columns: np.ndarray
+    known: np.ndarray
+    entries: np.ndarray
+    unexplained: np.ndarray
+    size: float
+
+    @classmethod
+    def of(
+        cls, columns: np.ndarray, known: np.ndarray, wrench: np.ndarray
+    ) -> "_BaseWrench":
+        """Return the wrench [rows 2 3] beside columns [rows 6 parameters]."""
+        deviations = wrench - wrench.mean(axis=0)
+        # Forces and moments count alike, whichever are larger.
+        sizes = np.sqrt(np.mean(deviations**2, axis=(0, 2)))
+        weights = np.repeat(1.0 / np.maximum(sizes, 1e-300), 3)
+        weighted_columns = columns * weights[:, None]
+        A = weighted_columns.reshape(-1, columns.shape[2])
+        # Entry (i, j) of the turn brings axis j of the sensor to axis i.
+        axes = np.einsum("ai,nbj->nbaij", np.eye(3), wrench)
+        weighted_axes = axes.reshape(-1, GROUP, 9) * weights[:, None]
+        entries = weighted_axes.reshape(-1, 9)
+        tool = (known * weights).ravel()
+
+        U, s, _ = np.linalg.svd(A, full_matrices=False)
+        U = U[:, s > BASE_LIMITS.rank * s[0]]
+        sides = np.column_stack([entries, -tool])
+        R = np.linalg.qr(sides - U @ (U.T @ sides), mode="r")
+        return cls(A, tool, entries, np.asarray(R), np.sqrt(deviations.size))
+
+    def best_turn(self, start: Matrix3) -> tuple[Matrix3, float]:
+        """Return the best turn near another one, and the share that is unexplained."""
+        turn = start
+        for _ in range(BASE_LIMITS.steps):
+            changes = np.stack([skew(axis) @ turn for axis in np.eye(3)])
+            slopes = self.unexplained[:, :9] @ changes.reshape(3, 9).T
+            step, *_ = np.linalg.lstsq(slopes, -self.errors(turn), rcond=None)
+            turn = scipy.spatial.transform.Rotation.from_rotvec(step).as_matrix() @ turn
+        return turn, self.share(turn)
+
+    def errors(self, turn: Matrix3) -> np.ndarray:
+        """Return what is unexplained along turned axes."""
+        return self.unexplained @ np.append(turn, 1.0)
+
+    def share(self, turn: Matrix3) -> float:
+        """Return the norm of what is unexplained, over that of the wrench."""
+        return float(np.linalg.norm(self.errors(turn)) / self.size)
+
+    def parameters(self, turn: Matrix3) -> np.ndarray:
+        """Return the parameters that explain the wrench along turned axes best."""
+        side = self.entries @ turn.ravel() - self.known
+        return np.linalg.lstsq(self.columns, side, rcond=BASE_LIMITS.rank)[0]
+
+
+def base_wrench_remarks(model: Model, observations: Observations) -> list[Remark]:
+    """Return what is wrong with the wrench of a sensor under the base, if any.
+
+    Args:
+        model: Model of the robot with the sensor.
+        observations: Observations of a log.
+    """
+    rows = slice(None, None, -(-observations.rows // BASE_LIMITS.rows))
+    motion = observations.reduced_motion[rows]
+    columns = np.asarray(model.regressor(motion))[:, :GROUP]
+    known = np.asarray(model.tool_forces(motion))[:, :GROUP]
+    measured = observations.reduced_forces[rows, :GROUP].reshape(-1, 2, 3)
+    wrench = _BaseWrench.of(columns, known, measured)
+    exchanged_wrench = _BaseWrench.of(columns, known, measured[:, ::-1])
+    turn, share = _least_turn(wrench)
+    _, share_if_exchanged = _least_turn(exchanged_wrench)
+    if share_if_exchanged < BASE_LIMITS.certain * share:
+        text = (
+            "forces and moments are exchanged: the bodies of the robot explain the "
+            "last three columns of `wrench` as forces. Name the three forces first."
+        )
+        return [Remark(text, Status.BAD)]
+    remarks = []
+    p = wrench.parameters(turn)
+    M = np.asarray(model.mass_matrix(p, motion.q))[:, GROUP:, GROUP:]
+    # Bodies of negative mass explain a wrench of the other sign as well.
+    if np.trace(M, axis1=1, axis2=2).mean() < 0.0:
+        remarks.append(Remark(OPPOSITE_SIGN, Status.BAD))
+    gain = share / wrench.share(np.eye(3))
+    if _angle(turn) > BASE_LIMITS.max_angle and gain < BASE_LIMITS.doubtful:
+        described = np.asarray(model.robot.rotation)[0]
+        text = _turn_text(described, turn, "the motion")
+        is_certain = gain < BASE_LIMITS.certain
+        status = Status.BAD if is_certain else Status.DOUBTFUL
+        remarks.append(Remark(text, status))
+    return remarks
+
+
+def _least_turn(wrench: _BaseWrench) -> tuple[Matrix3, float]:
+    """Return the smallest of the best turns, and the share that it leaves."""
+    starts = scipy.spatial.transform.Rotation.create_group("O").as_matrix()
+    turns = [wrench.best_turn(start) for start in starts]
+    least = min(share for _, share in turns)
+    equals = [x for x in turns if x[1] <= BASE_LIMITS.tie * least]
+    # The trace of a turn falls with its angle.
+    return max(equals, key=lambda x: np.trace(x[0]))
+
+
+OPPOSITE_SIGN = (
+    "the wrench has the opposite sign: it is the wrench of the load on the sensor. "
+    "Give `sign = -1` in `[sensor]`, or multiply it by -1."
+)
+
+
+def _angle(turn: Matrix3) -> float:
+    """Return the angle of a rotation [rad]."""
+    return float(scipy.spatial.transform.Rotation.from_matrix(turn).magnitude())
+
+
+def _turn_text(described: Matrix3, turn: Matrix3, witness: str) -> str:
+    """Return that the sensor is turned, and the attitude to write into the file."""
+    attitude = scipy.spatial.transform.Rotation.from_matrix(described @ turn)
+    numbers = ", ".join(f"{x:.1f}" for x in attitude.as_euler("xyz", degrees=True))
+    return (
+        f"the wrench is turned by {significant(np.rad2deg(_angle(turn)), 2)} "
+        f"degrees against its description: {witness} says that roll, pitch and yaw of "
+        f"the sensor are about [{numbers}] degrees. Give them as `rotation` in "
+        "`[sensor]`, or turn the wrench."
+    )

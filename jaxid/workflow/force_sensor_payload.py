@@ -21,6 +21,7 @@ from jaxid.measurement.force_sensors import along_sensor_axes
 from jaxid.measurement.log_columns import Selection
 from jaxid.measurement.observations import Observations, observe
 from jaxid.result_table import Remark, Status
+from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
 from jaxid.validation.diagnosis import diagnose
 from jaxid.validation.wrench_checks import wrench_remarks
@@ -36,17 +37,19 @@ MAX_PARTS = 10
 
 @dataclasses.dataclass(frozen=True)
 class ForceSensor:
-    """Six-axis force sensor at the end-effector, behind which the payload is.
+    """Six-axis force sensor at the end-effector, or under the base.
 
     Attributes:
         wrench: Columns of three forces [N], then three moments [N m], like
             `["fx", "fy", "fz", "tx", "ty", "tz"]`.
         sign: 1 if the force points up at rest, as that of the sensor on the load does;
             -1 if it points down, as most drivers have it.
-        rotation: Roll, pitch and yaw of the sensor's frame in that of the end-effector
-            [deg], like `[0.0, 0.0, 0.0]`.
+        rotation: Roll, pitch and yaw of the sensor's frame in that of the end-effector,
+            or of the ground under the base [deg], like `[0.0, 0.0, 0.0]`.
         position: Origin of the sensor's frame there [m], like `[0.0, 0.0, 0.0]`.
         in_ground: Whether the driver turns the wrench into the axes of the ground.
+        under_base: Whether the sensor is between ground and robot: `jaxid identify`
+            then uses it; otherwise `jaxid payload`.
     """
 
     wrench: Selection
@@ -54,27 +57,56 @@ class ForceSensor:
     rotation: tuple[float, float, float] = (0.0, 0.0, 0.0)
     position: tuple[float, float, float] = (0.0, 0.0, 0.0)
     in_ground: bool = False
+    under_base: bool = False
 
     def __post_init__(self) -> None:
-        """Refuse other signs.
+        """Refuse other signs, and a base that turns.
 
         Raises:
-            InputError: If the sign is neither 1 nor -1.
+            InputError: If the sign is neither 1 nor -1, or two keys do not go together.
         """
         if abs(self.sign) != 1:
             raise InputError(f"`sign` must be 1 or -1, but is {self.sign:g}.")
+        if self.in_ground and self.under_base:
+            raise InputError(
+                "`in_ground` is for sensors that turn: a sensor under the base does "
+                "not; give the ground's axes by `rotation`."
+            )
+
+    def on(self, robot: Robot) -> Robot:
+        """Return the robot with the sensor."""
+        rotation = rpy_rotation(np.deg2rad(self.rotation))
+        return robot.with_sensor(rotation, self.position, under_base=self.under_base)
 
     def columns(self, columns: Columns) -> Columns:
         """Return the columns of logs, with those of the wrench."""
         return dataclasses.replace(columns, wrench=self.wrench, wrench_sign=self.sign)
+
+    def beside(self, setup: Setup, columns: Columns) -> Setup:
+        """Return the setup of a robot on the sensor, for `jaxid identify`.
+
+        Logs without forces of the joints tell nothing of friction and rotors.
+
+        Raises:
+            InputError: If friction grows with the load.
+        """
+        if setup.load_friction:
+            raise InputError(
+                "`load` in `[model]` must not be given with a sensor under the base: "
+                "leave it out."
+            )
+        terms = setup.model.terms
+        if columns.forces is None:
+            terms = tuple(term for term in terms if term.body_parameters)
+        model = Model(self.on(setup.robot), (*terms, SensorBias()))
+        return dataclasses.replace(setup, unknowns=model)
 
     def base(self, setup: Setup, has_forces: bool) -> BaseParameters:
         """Return the base parameters of the robot with the sensor.
 
         Logs without forces of the joints tell of what is behind the sensor only.
         """
-        rotation = rpy_rotation(np.deg2rad(self.rotation))
-        robot = setup.robot.with_sensor(rotation, self.position)
+        robot = self.on(setup.robot)
         bodies = setup.model.terms if has_forces else (SensorLoad(),)
         return base_parameters(Model(robot, (*bodies, SensorBias(), SensorRotation())))
 

@@ -24,6 +24,7 @@ from jaxid.report.identification_page import body_table, motor_tables
 from jaxid.report.result_files import write_report
 from jaxid.result_table import Remark, Summarised, Table
 from jaxid.robot.collision_geometry import BodyShape
+from jaxid.robot.virtual_joints import GROUP
 from jaxid.validation.diagnosis import mistakes_in_logs
 from jaxid.validation.judgement import Judgement, Report, judge
 from jaxid.validation.torque_errors import (
@@ -54,7 +55,14 @@ class IdentificationReport(Summarised, Report):
     @property
     def shapes(self) -> list[BodyShape]:
         """Shapes of the robot's bodies in its file, as far as they can be read."""
-        return [] if self.robot_file is None else self.robot_file.shapes()
+        if self.robot_file is None:
+            return []
+        # The file does not know of a sensor under the base.
+        first = GROUP if self.fit.base.model.robot.has_base_sensor else 0
+        return [
+            (body + first if body >= 0 else body, shape)
+            for body, shape in self.robot_file.shapes()
+        ]
 
     @functools.cached_property
     def judgement(self) -> Judgement:
