@@ -8,7 +8,7 @@ them in place. Where JAX cannot compile such kernels, XLA computes the program.
 
 import functools
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import jax
@@ -29,17 +29,21 @@ MAX_OUTPUTS = 16
 
 Threads write their rows side by side, so that each store of a result touches many lines
 of memory. Measured on an H200: 7 results take 0.4 to 0.7 of XLA's time, 49 take 1.1.
+More results are stored by one kernel and put in place by another one.
 """
-MAX_PLACED_OUTPUTS = 0
-"""Results of a sample up to which two kernels compute and place them.
+RESULTS_OF_KERNEL = 48
+"""Distinct results that one kernel computes.
 
-They were not timed on a GPU yet, so that XLA computes all programs with many results:
-the regressor of a Panda, with 637, in 2.4 ms for 262,144 samples on an H200.
+Triton compiles a kernel in a time that grows with its stores and with the square of its
+operations: the 274 distinct results of a Panda's regressor take 29 CPU s in one kernel,
+9 in six. Threads of the six keep their numbers in registers, one of the one does not.
 """
 TILE = 64
 """Samples, and results, that an instance of the second kernel puts in place."""
 MAX_NODES = 2000
 """Length of a program up to which kernels were measured (1,604)."""
+MAX_ENTRIES = 2**31 - 1
+"""Entries of an array up to which kernels find them: places are numbers of 32 bits."""
 MIN_CAPABILITY = 8.0
 """First compute capability of NVIDIA GPUs for which XLA compiles by Triton."""
 
@@ -57,13 +61,15 @@ def has_triton() -> bool:
     return is_supported and min(capabilities) >= MIN_CAPABILITY
 
 
-def suits_kernel(program: Program, dtype: Any) -> bool:
+def suits_kernel(program: Program, *arrays: Array) -> bool:
     """Return whether kernels are the fastest form of a program on this GPU."""
     is_short = len(program.nodes) <= MAX_NODES
-    max_outputs = max(MAX_OUTPUTS, MAX_PLACED_OUTPUTS)
-    has_few_outputs = len(program.outputs) <= max_outputs
-    has_functions = dtype in (np.float32, np.float64)
-    return is_short and has_few_outputs and has_functions and has_triton()
+    is_constant = not program.distinct[0]
+    row_sizes = [len(program.outputs), *(x.shape[-1] for x in arrays)]
+    is_addressable = len(arrays[-1]) * max(row_sizes) <= MAX_ENTRIES
+    has_functions = arrays[-1].dtype in (np.float32, np.float64)
+    can_run = is_addressable and has_functions and has_triton()
+    return is_short and not is_constant and can_run
 
 
 def in_kernel(
@@ -119,39 +125,61 @@ def _results(program: Program, inputs: list[Array], interpret: bool) -> Array:
             value = jnp.asarray(values[x] if isinstance(x, int) else x, results.dtype)
             results[samples, k] = jnp.broadcast_to(value, BLOCK)
 
+    nodes, _ = program.distinct
     shape = (len(inputs[-1]), len(program.outputs))
-    return _call_kernel(program, inputs, write, shape, interpret)
+    return _call_kernel(program, nodes, inputs, write, shape, interpret)
 
 
 def _distinct_rows(program: Program, inputs: list[Array], interpret: bool) -> Array:
     """Compute the distinct results [results, samples] of the samples of one device."""
     nodes, _ = program.distinct
+    rows = _rows_of_group(program, inputs, 0, None, interpret)
+    for first in range(RESULTS_OF_KERNEL, len(nodes), RESULTS_OF_KERNEL):
+        rows = _rows_of_group(program, inputs, first, rows, interpret)
+    return rows
+
+
+def _rows_of_group(
+    program: Program,
+    inputs: list[Array],
+    first: int,
+    rows: Array | None,
+    interpret: bool,
+) -> Array:
+    """Compute some distinct results, from this one on, into the rows of all."""
+    nodes, _ = program.distinct
+    group = nodes[first : first + RESULTS_OF_KERNEL]
 
     def write(results, values, samples):
-        for k, node in enumerate(nodes):
-            results[k, samples] = jnp.broadcast_to(values[node], BLOCK)
+        for k, node in enumerate(group):
+            results[first + k, samples] = jnp.broadcast_to(values[node], BLOCK)
 
     shape = (len(nodes), len(inputs[-1]))
-    return _call_kernel(program, inputs, write, shape, interpret)
+    return _call_kernel(program, group, inputs, write, shape, interpret, rows)
 
 
 def _call_kernel(
     program: Program,
+    nodes: Sequence[int],
     inputs: list[Array],
     write: Callable[[Any, Mapping[int, Array], Array], None],
     shape: Shape,
     interpret: bool,
+    results: Array | None = None,
 ) -> Array:
-    """Compute all nodes, of which `write` puts some into a result of this shape."""
+    """Compute some nodes, which `write` puts into results of this shape.
+
+    Results that are given are overwritten where `write` stores, and kept elsewhere.
+    """
     # It takes a while to import, and only GPUs need it.
     from jax.experimental import pallas
     from jax.experimental.pallas import triton
 
     count = len(inputs[-1])
-    positions_by_use = _positions_by_use(program)
+    positions_by_use = _positions_by_use(program, nodes)
 
     def kernel(*references):
-        *columns, results = references
+        columns, results = references[: len(inputs)], references[-1]
         samples = _members(pallas.program_id(0), BLOCK, count)
         values: dict[int, Array] = {}
         for position in positions_by_use:
@@ -166,14 +194,16 @@ def _call_kernel(
             values[position] = value
         write(results, values, samples)
 
+    arguments = inputs if results is None else [*inputs, results]
     call = pallas.pallas_call(
         kernel,
         out_shape=_alike(inputs[-1], shape),
         grid=(math.ceil(count / BLOCK),),
+        input_output_aliases={} if results is None else {len(inputs): 0},
         compiler_params=triton.CompilerParams(num_warps=4),
         interpret=interpret,
     )
-    return call(*inputs)
+    return call(*arguments)
 
 
 def _placed(rows: Array, numbers: Array, constants: Array, *, interpret: bool) -> Array:
@@ -204,12 +234,14 @@ def _placed(rows: Array, numbers: Array, constants: Array, *, interpret: bool) -
 
 
 def _members(block: Array, size: int, count: int) -> Array:
-    """Return the numbers of the members of a block; those too many are the last one.
+    """Return the numbers of the members of a block, side by side.
 
-    Threads compute the last one again.
+    The last block begins earlier, so that it is full: some members are computed twice.
+    Triton sees that the numbers are consecutive, and loads what they stand for at once.
     """
-    members = size * jnp.asarray(block, int) + jnp.arange(size)
-    return jnp.minimum(members, count - 1)
+    start = jnp.minimum(size * block, max(count - size, 0))
+    members = start + jnp.arange(size, dtype=np.int32)
+    return members if count >= size else jnp.minimum(members, count - 1)
 
 
 def _alike(x: Array, shape: Shape) -> jax.ShapeDtypeStruct:
@@ -217,15 +249,20 @@ def _alike(x: Array, shape: Shape) -> jax.ShapeDtypeStruct:
     return jax.eval_shape(lambda x: jnp.broadcast_to(x[0, 0], shape), x)
 
 
-def _positions_by_use(program: Program):
-    """Return positions of all nodes, those of inputs where they are first read.
+def _positions_by_use(program: Program, nodes: Sequence[int]) -> tuple[int, ...]:
+    """Return positions of these nodes and of what they need, inputs where first read.
 
     If all inputs were loaded at the start, a thread's registers would not hold them.
     """
+    needed = set(nodes)
+    for position in reversed(range(len(program.nodes))):
+        if position in needed:
+            needed.update(program.nodes[position].uses)
     positions: dict[int, None] = {}
-    for position, node in enumerate(program.nodes):
+    for position in sorted(needed):
+        node = program.nodes[position]
         if node.operation is not Operation.INPUT:
             positions.update(dict.fromkeys((*node.uses, position)))
     # Inputs that no node reads are results.
-    positions.update(dict.fromkeys(range(len(program.nodes))))
+    positions.update(dict.fromkeys(nodes))
     return tuple(positions)

@@ -205,7 +205,7 @@ def on_rows(program: Program, *arrays: Array) -> Rows:
         block_run = functools.partial(_in_blocks, program)
         vectorised_run = functools.partial(_stored_at_once, program)
         runs = {"cpu": block_run, "default": vectorised_run}
-        if suits_kernel(program, arrays[-1].dtype):
+        if suits_kernel(program, *arrays):
             runs["cuda"] = functools.partial(in_kernel, program)
         return jax.lax.platform_dependent(*arrays, **runs)
 

@@ -89,14 +89,8 @@ def test_seven_joints(dtype, bound, on_gpu):
     assert error(found, expected) <= bound
 
 
-@pytest.fixture
-def places_results(monkeypatch):
-    """Many results by two kernels, which is off until it has been timed on a GPU."""
-    monkeypatch.setattr(gpu_kernel, "MAX_PLACED_OUTPUTS", 1000)
-
-
 @pytest.mark.parametrize("samples", [1, 2 * BLOCK + 1])
-def test_many_results_are_placed_by_a_second_kernel(samples, on_gpu, places_results):
+def test_many_results_are_placed_by_a_second_kernel(samples, on_gpu):
     model = jid.Model(ARM.robot, (*ARM.terms, jid.ConstantOffset()))
     _, *arrays = numbers(model, samples)
     found = jax.jit(lambda *x: model.regressor(jid.Motion(*x)))(*arrays)
@@ -217,21 +211,21 @@ def test_a_gpu_gets_one_kernel(name, has_gpu):
 
 @lowers_without_gpu
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_a_gpu_gets_two_kernels_for_many_results(dtype, has_gpu, places_results):
+def test_a_gpu_gets_kernels_for_many_results(dtype, has_gpu):
     p, *arrays = (x.astype(dtype) for x in numbers(PANDA, 300))
-    texts = [
-        compiled_for("cuda", PANDA.mass_matrix, p, arrays[0]),
-        compiled_for("cuda", lambda *x: PANDA.regressor(jid.Motion(*x)), *arrays),
-    ]
-    for text in texts:
-        assert text.count(KERNEL) == text.count("custom_call") == 2
+    texts = {
+        2: compiled_for("cuda", PANDA.mass_matrix, p, arrays[0]),
+        7: compiled_for("cuda", lambda *x: PANDA.regressor(jid.Motion(*x)), *arrays),
+    }
+    for kernels, text in texts.items():
+        assert text.count(KERNEL) == text.count("custom_call") == kernels
         for operation in ("transpose", "sine", "optimization_barrier", "concatenate"):
             assert f"stablehlo.{operation}" not in text
 
 
 @lowers_without_gpu
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
-def test_xla_transposes_each_input_once(dtype, has_gpu):
+def test_xla_transposes_each_input_once(dtype):
     """Results that XLA computes are stacked in place, in either precision."""
     p, *arrays = (x.astype(dtype) for x in numbers(PANDA, 300))
     text = compiled_for("cuda", PANDA.mass_matrix, p, arrays[0])
@@ -268,7 +262,7 @@ def test_each_device_of_a_mesh_gets_one_kernel(has_gpu):
 
 
 @lowers_without_gpu
-def test_each_device_of_a_mesh_places_its_results(has_gpu, places_results):
+def test_each_device_of_a_mesh_places_its_results(has_gpu):
     _, *arrays = numbers(ARM, 300)
     spec = PartitionSpec("d")
     mesh = Mesh(np.array(jax.devices()[:1]), ("d",))
@@ -282,17 +276,24 @@ def test_each_device_of_a_mesh_places_its_results(has_gpu, places_results):
     assert compiled_for("cuda", regressor, *divided).count(KERNEL) == 2
 
 
-def test_many_results_and_long_programs_are_left_to_xla(has_gpu):
+def test_what_kernels_cannot_compute_is_left_to_xla(has_gpu, monkeypatch):
     joints = (7,)
-    size = (PANDA.size,)
-    forces = program_of(PANDA, PANDA.forces, size, *[joints] * 3)
-    inertia = program_of(PANDA, PANDA.inertia, size, joints)
     columns = program_of(PANDA, PANDA.columns, *[joints] * 3)
-    assert gpu_kernel.suits_kernel(forces, np.dtype("float64"))
-    assert gpu_kernel.suits_kernel(forces, np.dtype("float32"))
-    assert not gpu_kernel.suits_kernel(forces, jnp.dtype("bfloat16"))
-    assert not gpu_kernel.suits_kernel(inertia, np.dtype("float64"))
-    assert not gpu_kernel.suits_kernel(columns, np.dtype("float64"))
+
+    def suits(program, samples=300, dtype="float64"):
+        rows = jax.ShapeDtypeStruct((samples, 7), jnp.dtype(dtype))
+        return gpu_kernel.suits_kernel(program, rows, rows, rows)
+
+    assert suits(columns)
+    assert suits(columns, dtype="float32")
+    assert not suits(columns, dtype="bfloat16")
+    # Places of results are numbers of 32 bits.
+    most_samples = (2**31 - 1) // (7 * PANDA.size)
+    assert suits(columns, most_samples)
+    assert not suits(columns, most_samples + 1)
+    assert not suits(trace(lambda q, qd, qdd: jnp.eye(7), *[joints] * 3))
+    monkeypatch.setattr(gpu_kernel, "MAX_NODES", len(columns.nodes) - 1)
+    assert not suits(columns)
 
 
 class Device:
