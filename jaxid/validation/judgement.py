@@ -172,7 +172,9 @@ def judge(report: Report) -> Judgement:
     """Judge an identified model by all that is known of it and of its logs."""
     fit = report.fit
     # One finding sums up what bounds do.
-    bound_notes = () if fit.consistency is None else fit.consistency.findings
+    bound_notes = ()
+    if fit.consistency is not None:
+        bound_notes = fit.consistency.findings(fit.base.model.robot)
     findings = [
         *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
         *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
@@ -308,8 +310,10 @@ def _judge_offsets(fit: Fit) -> Iterator[Remark]:
     estimates = zip(np.asarray(fit.parameters), fit.standard_deviations, strict=True)
     values = dict(zip(fit.base.names, estimates, strict=True))
     (offset,) = ConstantOffset.joint_parameters
-    for j, name in enumerate(robot.joint_names):
-        value, deviation = map(float, values.get(f"{offset.name}{j + 1}", (0.0, 0.0)))
+    for j in robot.driven:
+        name = robot.joint_names[j]
+        parameter = f"{offset.name}{robot.numbers[j]}"
+        value, deviation = map(float, values.get(parameter, (0.0, 0.0)))
         max_force = float(robot.known_max_forces[j])
         if abs(value) - 2.0 * deviation > MAX_OFFSET_SHARE * max_force:
             unit = robot.force_unit(j)

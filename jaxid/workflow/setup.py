@@ -270,7 +270,8 @@ class Setup(eqx.Module):
             # The first fit has chosen the pull, and says why.
             pull: Any = fit.consistency.pull
             estimator = dataclasses.replace(self.estimator, pull=pull)
-            notes = [x for x in fit.notes if x not in fit.consistency.notes]
+            first_notes = fit.consistency.notes(self.robot)
+            notes = [x for x in fit.notes if x not in first_notes]
         for _ in range(MAX_LOAD_FRICTION_FITS):
             # The columns of the bodies come first, whatever follows.
             size = self.robot.bodies * len(INERTIAL_NAMES)

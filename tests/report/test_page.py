@@ -275,11 +275,24 @@ def test_friction_that_the_file_states_is_no_load_of_its_bodies(fit):
 
 
 def test_a_weight_that_gravity_does_not_explain_is_pointed_out(fit):
-    robot = fit.base.model.robot
+    """Numbers in names count driven joints, of which a floating base has none."""
+    fixed_robot = fit.base.model.robot
+    fields = {"driven": (6, 7), "numbers": (*(0,) * 6, 1, 2)}
+    floating_robot = SimpleNamespace(
+        **fields,
+        joint_names=(*(f"base {k}" for k in range(6)), *fixed_robot.joint_names),
+        known_max_forces=np.append(np.full(6, np.inf), fixed_robot.known_max_forces),
+        force_unit=lambda j: "N m",
+    )
+    for robot in (fixed_robot, floating_robot):
+        _check_offsets(robot, fixed_robot)
+
+
+def _check_offsets(robot, fixed_robot):
     base = SimpleNamespace(
         model=SimpleNamespace(robot=robot), names=("m1", "fo1", "fo2")
     )
-    limits = np.asarray(robot.known_max_forces)
+    limits = np.asarray(fixed_robot.known_max_forces)
     for share, spread, count in ((0.1, 0.0, 0), (-0.8, 0.3, 0), (-0.8, 0.0, 1)):
         p = np.array([1e6, share * limits[0], 0.01 * limits[1]])
         deviations = spread * np.abs(p)
@@ -287,7 +300,7 @@ def test_a_weight_that_gravity_does_not_explain_is_pointed_out(fit):
         sick = SimpleNamespace(base=base, parameters=p, standard_deviations=deviations)
         found = list(_judge_offsets(sick))
         assert [r.status for r in found] == [Status.DOUBTFUL] * count
-    assert f"joint `{robot.joint_names[0]}`" in found[0].text.lower()
+    assert f"joint `{fixed_robot.joint_names[0]}`" in found[0].text.lower()
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,7 @@
 """Physically consistent estimation: parameters of bodies that can exist."""
 
 import dataclasses
+from collections.abc import Iterable
 
 import equinox as eqx
 import numpy as np
@@ -8,6 +9,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, BaseVector, Bool, Float, Indices, Joints, Texts
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
+from jaxid.robot.robot import Robot
 
 from ..estimators import (
     AbstractEstimator,
@@ -69,15 +71,15 @@ class Consistency(eqx.Module):
     pull: EntropicPull | None
     shift: BaseVector
 
-    @property
-    def findings(self) -> Texts:
-        """Sentences about the effect of the bounds on residuals and parameters."""
+    def findings(self, robot: Robot) -> Texts:
+        """Return sentences about the effect of the bounds on residuals and masses."""
         percent = 100 * self.residual_increase
         sentences = [
             f"the weighted residuals are {percent:.2g} % larger than without bounds."
         ]
         if self.masses_from_bounds:
-            names = ", ".join(f"m{k + 1}" for k in self.masses_from_bounds)
+            numbers = _numbers(robot, self.masses_from_bounds)
+            names = ", ".join(f"m{number}" for number in numbers)
             sentences.append(
                 f"forces alone do not determine the masses {names}: their values, and "
                 "parameters that depend on them, reflect the bounds; base parameters "
@@ -87,12 +89,11 @@ class Consistency(eqx.Module):
             sentences.append(f"active bounds: {'; '.join(self.active)}.")
         return tuple(sentences)
 
-    @property
-    def notes(self) -> Texts:
-        """All sentences for the user."""
+    def notes(self, robot: Robot) -> Texts:
+        """Return all sentences for the user."""
         sentences = [
             f"physically consistent: {self.bounds}.",
-            *self.findings,
+            *self.findings(robot),
             "standard deviations are those of the estimate without bounds; intervals "
             "include the distance from it.",
         ]
@@ -103,6 +104,11 @@ class Consistency(eqx.Module):
                 f"{2 * solver.TOLERANCE:.0e} is allowed: widen the bounds."
             )
         return tuple(sentences)
+
+
+def _numbers(robot: Robot, bodies: Iterable[int]) -> list[int]:
+    """Return the numbers of bodies in names of parameters; massless ones have none."""
+    return [robot.numbers[robot.solid_bodies[body]] for body in bodies]
 
 
 class PhysicallyConsistent(AbstractEstimator):
@@ -177,7 +183,11 @@ class PhysicallyConsistent(AbstractEstimator):
             standard=p,
             consistency=consistency,
             unbounded=unbounded_estimate.parameters,
-            notes=(*unbounded_estimate.notes, *consistency.notes, *pull_notes),
+            notes=(
+                *unbounded_estimate.notes,
+                *consistency.notes(rows.robot),
+                *pull_notes,
+            ),
         )
 
     def _choose_pull(
@@ -250,7 +260,9 @@ def _active_bounds(
     """Name the bounds that keep the estimate from a better one."""
 
     def numbers(is_active) -> str:
-        return ", ".join(str(body + 1) for body in np.flatnonzero(is_active))
+        return ", ".join(
+            map(str, _numbers(base.model.robot, np.flatnonzero(is_active)))
+        )
 
     is_tight = solver.prices(program, optimum) > MIN_PRICE
     names = feasible.linear_bounds().names

@@ -1,5 +1,8 @@
 """The estimator: definite mass matrices, bounds and priors that hold, and its notes."""
 
+import dataclasses
+from types import SimpleNamespace
+
 import arms
 import numpy as np
 import pytest
@@ -53,6 +56,14 @@ def test_the_mass_matrix_is_definite_where_least_squares_fail(panda, consistent)
     drives = [k for k, name in enumerate(names) if name[:2] in ("fv", "fc", "Ia")]
     assert (full[drives] >= 0).all()
     assert (full[[k for k, n in enumerate(names) if n[:2] == "fo"]] < 0).any()
+
+
+def test_masses_have_the_numbers_of_their_parameters(consistent):
+    """The trunk of a robot on legs is body 0, whose first five joints move no mass."""
+    numbers = (*(0,) * 6, 1, 2)
+    dog = SimpleNamespace(numbers=numbers, solid_bodies=(5, 6, 7))
+    found = dataclasses.replace(consistent.consistency, masses_from_bounds=(0, 2))
+    assert "the masses m0, m2:" in " ".join(found.findings(dog))
 
 
 def test_without_noise_the_truth_is_found():
