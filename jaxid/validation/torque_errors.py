@@ -1,5 +1,6 @@
 """Validation: torque errors, and definiteness of the mass matrix (Eq. 37, Sec. 5)."""
 
+import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
@@ -340,6 +341,14 @@ def torque_errors(
         positions=positions,
         band=observations.filter.low_pass(observations.sample_time).cutoff,
     )
+
+
+def errors_of_parameters(
+    fit: Fit, parameters: AnyArray, logs: Sequence[Observations]
+) -> tuple[TorqueErrors, ...]:
+    """Return torque errors of other parameters of the model of a fit."""
+    other_fit = dataclasses.replace(fit, parameters=parameters)
+    return tuple(torque_errors(other_fit, log) for log in logs)
 
 
 def relative_error(logs: Sequence[TorqueErrors]) -> float:

@@ -3,7 +3,7 @@
 import dataclasses
 import functools
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 from typing import NamedTuple
@@ -30,12 +30,12 @@ from jaxid.validation.judgement import Judgement, Report, judge
 from jaxid.validation.torque_errors import (
     TorqueErrors,
     error_table,
-    torque_errors,
+    errors_of_parameters,
     validate,
 )
 
 from .log_loading import LoadedLog, fitted_share, load_logs, select_filter
-from .robot_file import RobotFile
+from .robot_file import RobotFile, base_parameters_of, claimed_parameters
 from .setup import Paths, Progress, Setup, ignore_progress
 
 MAX_COLUMNS = 5
@@ -281,30 +281,14 @@ def errors_of_claims(setup: Setup, fit: Fit, logs: Sequence[Observations]) -> Cl
     values = setup.robot_file.claims()
     if not values:
         return Claims()
-    parameters = _base_parameters(fit, values)
-    errors = _torque_errors_of(fit, parameters, logs)
+    base = fit.base
+    parameters = base_parameters_of(values, base)
+    errors = errors_of_parameters(fit, parameters, logs)
     # Files often state friction that nobody has measured.
     loads = {k: x for k, x in values.items() if not k.startswith(("fv", "fc"))}
     load_errors = errors[:1]
     if len(loads) < len(values):
-        load_errors = _torque_errors_of(fit, _base_parameters(fit, loads), logs[:1])
-    names = fit.base.model.parameter_names
-    is_claimed = [names[k] in values for k in fit.base.indices]
-    claimed_parameters = np.where(is_claimed, parameters, np.nan)
+        load_parameters = base_parameters_of(loads, base)
+        load_errors = errors_of_parameters(fit, load_parameters, logs[:1])
     bodies = setup.robot_file.bodies()
-    return Claims(errors, load_errors, claimed_parameters, bodies)
-
-
-def _base_parameters(fit: Fit, values: Mapping[str, float]) -> np.ndarray:
-    """Return base parameters of standard ones, which are 0 unless they are named."""
-    names = fit.base.model.parameter_names
-    standard_parameters = [values.get(name, 0.0) for name in names]
-    return np.asarray(fit.base.from_standard(standard_parameters))
-
-
-def _torque_errors_of(
-    fit: Fit, parameters: np.ndarray, logs: Sequence[Observations]
-) -> tuple[TorqueErrors, ...]:
-    """Return torque errors of other parameters of the model of a fit."""
-    other_fit = dataclasses.replace(fit, parameters=parameters)
-    return tuple(torque_errors(other_fit, log) for log in logs)
+    return Claims(errors, load_errors, claimed_parameters(values, base), bodies)

@@ -17,6 +17,7 @@ from jaxid.robot.limits_and_drives import complete_limits
 from jaxid.robot.robot import Robot
 
 from .excitation_settings import Excitation
+from .robot_file import claimed_parameters
 from .setup import Setup
 
 UNKNOWN_SHARE = 0.3
@@ -51,10 +52,7 @@ def find_nominal(setup: Setup, excitation: Excitation) -> Nominal | None:
     claims = {} if setup.robot_file is None else setup.robot_file.claims()
     if not claims:
         return None
-    names = setup.model.parameter_names
-    values = setup.base.from_standard([claims.get(name, 0.0) for name in names])
-    is_claimed = [names[k] in claims for k in setup.base.indices]
-    return Nominal(np.where(is_claimed, np.asarray(values), np.nan), None)
+    return Nominal(claimed_parameters(claims, setup.base), None)
 
 
 def _of_earlier_fit(base: BaseParameters, report: str) -> Nominal:

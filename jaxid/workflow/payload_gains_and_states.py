@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray
 from jaxid.errors import InputError
 from jaxid.identification.drive_gains import DriveGains, identify_drive_gains
 from jaxid.identification.estimators import Complete
@@ -37,7 +36,7 @@ from jaxid.report.several_runs_report import RunsReport
 from jaxid.result_table import Remark, Status
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS, Tool
 from jaxid.validation.diagnosis import mistakes_in_logs
-from jaxid.validation.torque_errors import TorqueErrors, torque_errors
+from jaxid.validation.torque_errors import errors_of_parameters
 
 from .force_sensor_payload import ForceSensor, payload_of_logs, sensor_logs
 from .log_loading import load_logs, select_filter
@@ -116,26 +115,6 @@ def add_run(
     return fit
 
 
-def errors_of(
-    fit: Fit, parameters: AnyArray, logs: Sequence[Observations]
-) -> list[TorqueErrors]:
-    """Return the torque errors of parameters on the logs of a run."""
-    model = dataclasses.replace(fit, parameters=parameters)
-    return [torque_errors(model, log) for log in logs]
-
-
-def fit_with_and_without_load(
-    setup: Setup,
-    unloaded: Paths,
-    loaded: Paths,
-    columns: Columns,
-    progress: Progress,
-) -> Runs:
-    """Fit the runs without and with a load."""
-    groups = separate_groups(unloaded, loaded)
-    return fit_runs(setup, groups, columns, progress)
-
-
 def separate_groups(unloaded: Paths, loaded: Paths) -> dict[str, list[Path]]:
     """Return the logs without and with a load.
 
@@ -193,7 +172,8 @@ def identify_payload_from_logs(
             "give a log without the payload, too; or describe a force sensor in "
             "`[sensor]`, behind which everything is payload."
         )
-    runs = fit_with_and_without_load(setup, unloaded, loaded, columns, progress)
+    groups = separate_groups(unloaded, loaded)
+    runs = fit_runs(setup, groups, columns, progress)
     payload = identify_payload(*runs.fits, body=body, mass=mass)
     loaded_fit = runs.fits[1]
     doubts = _as_doubts([*runs.doubts, *runs.gain_doubts])
@@ -257,8 +237,8 @@ def payload_report(
     answer = payload_answer(
         payload,
         robot,
-        errors_of(loaded_fit, parameters - load, logs),
-        errors_of(loaded_fit, parameters, logs),
+        errors_of_parameters(loaded_fit, parameters - load, logs),
+        errors_of_parameters(loaded_fit, parameters, logs),
     )
     return RunsReport(
         "payload",
@@ -290,7 +270,8 @@ def identify_gains_from_logs(
         load: The load; or its mass if it is at the end-effector [kg].
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
-    runs = fit_with_and_without_load(setup, unloaded, loaded, columns, progress)
+    groups = separate_groups(unloaded, loaded)
+    runs = fit_runs(setup, groups, columns, progress)
     unloaded_fit, loaded_fit = runs.fits
     drives = identify_drive_gains(unloaded_fit, loaded_fit, load)
     names = drives.joint_names
@@ -359,7 +340,7 @@ def identify_states_from_logs(
     parameter_tables = [comparison.summary() for comparison in comparisons]
     progress("predicting torques", 0.0)
     errors = {
-        state: errors_of(fit, states.fit(state).parameters, logs)
+        state: errors_of_parameters(fit, states.fit(state).parameters, logs)
         for state, fit, logs in zip(groups, runs.fits, runs.logs, strict=True)
     }
     content = {

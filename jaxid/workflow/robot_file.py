@@ -6,7 +6,8 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import Float, Numbers
+from jaxid.arrays import Float, Numbers, Vector
+from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.consistency import consistency_margin
 from jaxid.io import FilePath
@@ -136,6 +137,19 @@ class RobotFile:
                 if value > 0.0 or (symbol == "fo" and value):
                     claims[f"{symbol}{joint}"] = float(value)
         return claims
+
+
+def base_parameters_of(claims: Mapping[str, float], base: BaseParameters) -> Vector:
+    """Return base parameters of standard ones, which are 0 unless they are named."""
+    standard_parameters = [claims.get(x, 0.0) for x in base.model.parameter_names]
+    return np.asarray(base.from_standard(standard_parameters))
+
+
+def claimed_parameters(claims: Mapping[str, float], base: BaseParameters) -> Vector:
+    """Return base parameters of standard ones; NaN unless they are named."""
+    names = base.model.parameter_names
+    is_claimed = [names[k] in claims for k in base.indices]
+    return np.where(is_claimed, base_parameters_of(claims, base), np.nan)
 
 
 def _named_bodies(bodies: np.ndarray, first_number: int) -> dict[str, float]:
