@@ -257,11 +257,12 @@ def motor_tables(robot: Robot) -> list[Table]:
     if drives.is_direct:
         return []
     turns = []
-    for row in np.asarray(drives.reduction):
+    driven = list(robot.driven)
+    for row in np.asarray(drives.reduction)[driven]:
         joints = np.flatnonzero(row)
         turns.append(" + ".join(f"{row[j]:.6g} {robot.joint_names[j]}" for j in joints))
     columns = [
-        Column("motor", list(range(1, robot.joints + 1))),
+        Column("motor", list(range(1, len(driven) + 1))),
         Column("turns", turns),
     ]
     for name, values, unit in (
@@ -269,8 +270,9 @@ def motor_tables(robot: Robot) -> list[Table]:
         ("largest\ntorque", drives.max_torques, "N m"),
         ("rotor\ninertia", drives.rotor_inertia, "kg m²"),
     ):
-        if np.isfinite(values).any() and np.any(values):
-            columns.append(Column(name, np.asarray(values), unit))
+        values_of_motors = np.asarray(values)[driven]
+        if np.isfinite(values_of_motors).any() and np.any(values_of_motors):
+            columns.append(Column(name, values_of_motors, unit))
     return [Table("motors", *columns)]
 
 

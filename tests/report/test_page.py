@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 import jaxid as jid
+from jaxid.report.identification_page import motor_tables
 from jaxid.report.joint_estimates import correlation_blocks, joint_table
 from jaxid.report.page import code, folded, picture, render_page
 from jaxid.result_table import SEVERITIES, Column, Remark, Status, Table
@@ -311,3 +312,20 @@ def test_bounds_that_the_log_contradicts_are_not_good(consistent, price, status)
     costly = dataclasses.replace(consistent.consistency, residual_increase=price)
     (found,) = _judge_bounds(dataclasses.replace(consistent, consistency=costly))
     assert found.status is status
+
+
+def test_motors_are_those_of_driven_joints(tmp_path):
+    """A trunk moves in six directions, but no motor moves it."""
+    inertial = (
+        "<inertial><mass value='1'/><inertia ixx='1' iyy='1' izz='1' ixy='0' ixz='0' "
+        "iyz='0'/></inertial>"
+    )
+    (tmp_path / "dog.urdf").write_text(
+        f"<robot name='dog'><link name='trunk'>{inertial}</link><link name='leg'>"
+        f"{inertial}</link><joint name='hip' type='continuous'><parent link='trunk'/>"
+        "<child link='leg'/><axis xyz='0 1 0'/></joint></robot>"
+    )
+    robot = jid.load_urdf(tmp_path / "dog.urdf", floating=True)
+    ratios = np.array([*np.ones(6), 8.0])
+    (table,) = motor_tables(robot.replace(drives=jid.Drives(7, reduction=ratios)))
+    assert table.rows == [("1", "8 hip")]
