@@ -10,8 +10,10 @@ projected with MuJoCo's own Jacobians of the points (its constraints are soft).
 Coverage: 10 s at 200 Hz, five harmonics of 0.1 Hz as large as the reach allows, viscous
 friction of 2 N m s and dry friction of 3 N m at the motors (N s/m and N at a slide),
 white noise of 0.5 N m, angles exact; `jid.identify` with default settings, and the
-share of all base parameters whose 95 % interval holds the truth. Times are CPU times of
-one process, without compiling.
+share of all base parameters whose 95 % interval holds the truth. With friction of the
+joints without a motor, they have MuJoCo's damping of 0.4 N m s and `frictionloss` of
+0.6 N m (N s/m and N at a slide), and the fit predicts another motion. Times are CPU
+times of one process, without compiling.
 """
 
 import sys
@@ -33,6 +35,7 @@ jax.config.update("jax_enable_x64", True)
 
 RATE, DURATION, NOISE = 200.0, 10.0, 0.5
 VISCOUS, DRY = 2.0, 3.0
+PASSIVE_VISCOUS, PASSIVE_DRY = 0.4, 0.6
 ASKED = {"five-bar": (11, 15), "palletiser": (20, 26)}
 REPEATS = 7
 
@@ -159,6 +162,50 @@ def coverage_row(name, case, draws):
     return Row(name, what, f"{draws} draws", "93 to 97 %", f"{share:.1f} %", holds)
 
 
+def passive_friction_row(name, case, draws):
+    """Compare models with and without the friction of joints without a motor."""
+    passive = [k for k in range(case.model.nv) if k not in case.motors]
+    motion, unseen = case.series(3), case.series(8)
+    try:
+        case.model.dof_damping[passive] = PASSIVE_VISCOUS
+        case.model.dof_frictionloss[passive] = PASSIVE_DRY
+        forces, expected = (
+            case.forces(x) + VISCOUS * x.qd + DRY * np.tanh(x.qd / 0.02)
+            for x in (motion, unseen)
+        )
+    finally:
+        case.model.dof_damping[passive] = 0.0
+        case.model.dof_frictionloss[passive] = 0.0
+    plain = case.model_of(friction=True)
+    models = {
+        "without": plain,
+        "with": jid.Model(case.robot, (*plain.terms, jid.terms.PassiveFriction())),
+    }
+    friction = np.repeat([VISCOUS, DRY], case.robot.joints)
+    friction_of_all = np.repeat([PASSIVE_VISCOUS, PASSIVE_DRY], len(passive))
+    texts = []
+    for key, model in models.items():
+        base = jid.base_parameters(model)
+        parameters = np.concatenate([case.bodies, friction, friction_of_all])
+        truth = base.from_standard(parameters[: model.size])
+        random = np.random.default_rng(4)
+        squares, inside = [], []
+        for _ in range(draws):
+            noisy = forces + random.normal(0.0, NOISE, forces.shape)
+            observations = jid.Observations.of(
+                motion.q, motion.qd, motion.qdd, noisy, sample_time=1 / RATE
+            )
+            fit = jid.identify(base, observations)
+            low, high = np.asarray(fit.intervals()).T
+            inside.append((low < truth) & (truth < high))
+            squares.append(np.sum((fit.predict(unseen) - expected) ** 2))
+        error = 100 * np.sqrt(np.mean(squares) / np.sum(expected**2))
+        share = 100 * float(np.mean(inside))
+        texts.append(f"{key} {error:.1f} %, coverage {share:.1f} %")
+    what = "friction of joints without a motor: error on another motion"
+    return Row(name, what, f"{draws} draws", "-", "; ".join(texts))
+
+
 def speed_row(name, case, samples):
     """Compare the time of the regressor with that of the tree's."""
     motion = case.motion(5, samples)
@@ -202,6 +249,8 @@ def main():
         rows.append(forces_row(name, case, samples))
         rows.append(base_row(name, case))
         rows.append(coverage_row(name, case, draws))
+        if name in MECHANISMS:
+            rows.append(passive_friction_row(name, case, max(2, draws // 4)))
         rows.append(speed_row(name, case, 100 if given.quick else 4000))
     hand_over(rows, given.json)
 

@@ -127,6 +127,7 @@ KEYS: dict[str, TomlTable] = {
         "coulomb": (bool, DRY_FRICTION),
         "square_root": bool,
         "springs": bool,
+        "passive_friction": bool,
     },
     "recording": {
         "angles": Column,

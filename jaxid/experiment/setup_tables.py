@@ -142,6 +142,7 @@ class Effects:
         coulomb: Dry friction, as a table; or none, like `false`.
         square_root: Friction that grows more slowly than speed.
         springs: A spring at each joint that pulls it to a position of rest.
+        passive_friction: Friction of the joints that closed loops move.
     """
 
     principal_axes: bool = False
@@ -154,6 +155,7 @@ class Effects:
     coulomb: bool | DryFriction | None = None
     square_root: bool = False
     springs: bool = False
+    passive_friction: bool = False
 
     def __post_init__(self) -> None:
         if self.load and self.principal_axes:

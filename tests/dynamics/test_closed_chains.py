@@ -9,6 +9,7 @@ from mechanisms import MECHANISMS, mjcf, projection
 import jaxid as jid
 from jaxid.errors import InputError
 from jaxid.export.mujoco_model import mjcf_text
+from jaxid.report.parameter_words import in_words
 from jaxid.robot.loop_assembly import with_loops
 from jaxid.robot.urdf import urdf_parameters
 
@@ -71,6 +72,33 @@ def test_forces_and_mass_matrix_are_projected_ones(mechanism, path):
     sample = (robot.close(motion.q)[0], motion.qd[0], motion.qdd[0])
     columns = jax.jit(model.spatial_form.columns)(*sample)
     np.testing.assert_allclose(columns @ p, forces[0], **tolerance)
+
+
+def test_friction_of_passive_joints_acts_by_the_ratios_of_mujoco(mechanism, path):
+    robot = jid.load_mjcf(path)
+    term = jid.terms.PassiveFriction()
+    model = jid.Model(robot, (term,))
+    motion = motion_of(robot, mechanism.spread)
+    passive = range(robot.joints, robot.bodies)
+    viscous, dry = np.random.default_rng(7).uniform(0.5, 2.0, (2, len(passive)))
+    expected = []
+    for tree, _, _, order in projected(mechanism, robot, motion):
+        joints = [order.index(body) for body in passive]
+        rates = tree.qd[joints]
+        friction = viscous * rates + dry * np.tanh(rates / 0.01)
+        expected.append(tree.ratios[joints].T @ friction)
+    p = np.concatenate([viscous, dry])
+    np.testing.assert_allclose(model.inverse_dynamics(p, motion), expected, atol=1e-9)
+    np.testing.assert_allclose(model.regressor(motion) @ p, expected, atol=1e-9)
+    assert (term.lower_bounds(robot) == 0.0).all()
+    places = [in_words(name, model)[1] for name in model.parameter_names]
+    assert places == 2 * [f"joint {robot.body_names[body]}" for body in passive]
+
+
+def test_an_arm_has_no_passive_joints():
+    arm = jid.robots.planar_arm()
+    with pytest.raises(InputError, match="`passive_friction`"):
+        _ = jid.Model(arm, (jid.terms.PassiveFriction(),)).parameter_names
 
 
 def test_base_parameters_are_as_many_as_the_rank_of_the_projected_tree(mechanism, path):

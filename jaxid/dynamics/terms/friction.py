@@ -11,9 +11,15 @@ from jaxid.arrays import AnyArray, Float, matching, one_or_each
 from jaxid.dynamics import projection_equation
 from jaxid.errors import InputError
 from jaxid.robot.inertia import INERTIAL_NAMES
+from jaxid.robot.joint_coordinates import speed_ratios
 from jaxid.robot.robot import Robot
 
-from .dry_friction_transitions import AbstractTransition, EachJoint, Tanh
+from .dry_friction_transitions import (
+    USUAL_SPEED,
+    AbstractTransition,
+    EachJoint,
+    Tanh,
+)
 from .term import AbstractTerm, JointParameter, on_drives
 
 
@@ -174,6 +180,60 @@ class StribeckFriction(AbstractDryFriction):
         return jnp.concatenate(
             [on_drives(robot, sign), on_drives(robot, static_friction)], axis=1
         )
+
+
+class PassiveFriction(AbstractDryFriction):
+    r"""Friction of the joints that closed loops move, viscous and dry.
+
+    It acts on the motors by $\Gamma^T$. Its parameters are `fv3`, … with the numbers of
+    these joints, then `fc3`, …. Joints that always turn alike share one parameter.
+    """
+
+    transition: AbstractTransition = Tanh(USUAL_SPEED)
+    is_switch = True
+    choice = "friction of passive joints"
+
+    @classmethod
+    def with_transition(cls, transition):
+        """Return the term with its own transition: that of motors may differ."""
+        return cls()
+
+    @property
+    def meanings(self):
+        """Those of the friction of motors."""
+        terms = (ViscousFriction(), CoulombFriction())
+        return terms[0].meanings | terms[1].meanings
+
+    def parameters(self, robot):
+        """Return names and units: viscous friction, then dry friction.
+
+        Raises:
+            InputError: If the robot has no joint that loops move.
+        """
+        if not robot.loops:
+            raise InputError(
+                f"`{robot.name}` has no joints that closed loops move: leave "
+                "`passive_friction` out."
+            )
+        parameters = []
+        for term in (ViscousFriction(), CoulombFriction()):
+            ((name, _, units, _),) = term.joint_parameters
+            for body in range(robot.bodies - len(robot.loop_rows), robot.bodies):
+                unit = units[0] if robot.turns[body] else units[1]
+                parameters.append((f"{name}{robot.numbers[body]}", unit))
+        return tuple(parameters)
+
+    def columns(self, robot, q, qd, qdd):
+        """Return the forces on the motors of unit friction at the passive joints."""
+        ratios = speed_ratios(robot, q)[-len(robot.loop_rows) :]
+        rates = ratios @ qd
+        dry_friction = self.transition(rates)
+        friction = jnp.concatenate([jnp.diag(rates), jnp.diag(dry_friction)], axis=1)
+        return ratios.T @ friction
+
+    def lower_bounds(self, robot):
+        """Return zeros: friction takes energy away."""
+        return np.zeros(len(self.parameters(robot)))
 
 
 class LoadFriction(AbstractDryFriction):
