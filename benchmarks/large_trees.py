@@ -7,6 +7,10 @@ seconds of CPU time; it includes the trace. The Python loop over Pinocchio's fun
 runs in turn with ours in the same process and stores each result into a new array of
 as many samples: above 32 MB the pages of such an array are new in each turn. Where ours
 stores no dense result, the loop uses the memory of some samples again.
+Functions with large results take arrays of NumPy, as the loop does; all others, and
+those called `compiled_`, are under `jit`. There XLA's memory has small pages, and
+filling it takes longer than the loop, unless `GLIBC_TUNABLES=glibc.malloc.hugetlb=1` is
+set.
 Bodies only, float64. The floating base of Go2, Talos and G1 is a body on six virtual
 joints, as `jid.load_urdf(file, floating=True)` makes it; Pinocchio takes its own free
 flyer.
@@ -25,6 +29,7 @@ import timing
 SAMPLES = 4096
 SAMPLES_IN_CACHE = 50
 SPARSE = ("gram", "packed_regressor")
+LARGE = ("mass_matrix", "regressor")
 FLOATING_JOINTS = 6
 FILES = {
     "Go2": "go2_description/urdf/go2.urdf",
@@ -59,6 +64,8 @@ FUNCTIONS = (
     "gram",
     "packed_regressor",
     "regressor",
+    "compiled_mass_matrix",
+    "compiled_regressor",
 )
 
 
@@ -168,8 +175,8 @@ class Call(NamedTuple):
     """The same quantity of many samples by both packages.
 
     Attributes:
-        ours: Compiled function of `arguments`.
-        arguments: Arrays of JAX.
+        ours: Function of `arguments`.
+        arguments: Arrays of NumPy or JAX.
         values: Result of ours for some samples, as Pinocchio gives it.
         loop: Pinocchio's function of one sample's number.
         shape: Shape of its result.
@@ -184,6 +191,8 @@ class Call(NamedTuple):
 
 def call(name: str, function: str, samples: int) -> Call:
     """Return the calls of a function for a robot."""
+    is_compiled = function not in LARGE
+    function = function.removeprefix("compiled_")
     import jax
     import jax.numpy as jnp
     import numpy as np
@@ -236,7 +245,10 @@ def call(name: str, function: str, samples: int) -> Call:
         ),
         "regressor": (lambda *x: model.regressor(jid.Motion(*x)), arrays),
     }[function]
-    compiled = jax.jit(lambda *x: ours(*x))
+    if is_compiled:
+        ours = jax.jit(lambda *x, run=ours: run(*x))
+    else:
+        arguments = tuple(map(np.asarray, arguments))
 
     def loop(k):
         return run(fast, data, coordinates[k], qd[k], qdd[k])
@@ -252,7 +264,7 @@ def call(name: str, function: str, samples: int) -> Call:
         by_body = np.array(rows).reshape(count, n, n, 10)[..., ORDER] * SIGNS
         return by_body[:, :, list(robot.solid_bodies)].reshape(count, n, -1)
 
-    return Call(compiled, arguments, values, loop, shape)
+    return Call(ours, arguments, values, loop, shape)
 
 
 def difference(function: str, result: Call, samples: int) -> float:
@@ -343,8 +355,9 @@ def main() -> None:
                 f"difference {figures['error']:.0e}"
             )
             asked, holds = "-", None
-            if function in ASKED.get(name, {}):
-                seconds, ratio = ASKED[name][function]
+            quantity = function.removeprefix("compiled_")
+            if quantity in ASKED.get(name, {}):
+                seconds, ratio = ASKED[name][quantity]
                 asked = f"<= {seconds} CPU s, >= {ratio:g}x"
                 holds = figures["compile"] <= seconds and figures["ratio"] >= ratio
             if "slow compile" in figures["stderr"]:

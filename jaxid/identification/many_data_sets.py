@@ -27,7 +27,7 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import JointRegressor
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations
-from jaxid.program.sample_methods import opened
+from jaxid.program.open_model import opened
 from jaxid.robot.robot import Robot
 
 from .batch_solution import BatchFit, DataSets, solve

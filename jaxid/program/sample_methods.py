@@ -1,13 +1,13 @@
 """Methods for one sample applied to many: in NumPy, or in compiled blocks.
 
-A method of a model is traced once into a scalar program, with numbers of the model that
-JAX is tracing, or in which models differ, as inputs; the programs of the models that
-were used last are kept. Derivatives take the model's spatial form, which is a short
-program on whole arrays.
+A method of a model is traced once into a scalar program; the programs of the models
+that were used last are kept. Derivatives take the model's spatial form, which is a
+short program on whole arrays.
 """
 
 import dataclasses
 import functools
+import itertools
 import math
 import threading
 from collections import OrderedDict
@@ -33,104 +33,24 @@ from jaxid.errors import InputError
 from .equal_parts import find_equal_parts
 from .jax_transformation_rules import with_derivatives_of
 from .numpy_evaluation import evaluate
-from .program import Program, Shape
+from .open_model import opened, with_open_numbers
+from .program import Program, Shape, select_outputs
 from .trace import trace
 from .xla import kernel_options
 from .xla_sample_blocks import BLOCK, on_rows
 
-
-class OpenModel(eqx.Module):
-    """A method for one sample, whose first argument are numbers of the model."""
-
-    model: eqx.Module  # model; in the place of these numbers it has any others
-    method: str = eqx.field(static=True)  # name of the method
-    # leaves of the model that have such numbers, and their positions in each
-    places: tuple[tuple[int, tuple[int, ...]], ...] = eqx.field(static=True)
-
-    def call(self, numbers: AnyArray, *arguments: AnyArray) -> Array:
-        """Call the method of the model with these numbers."""
-        leaves, structure = jax.tree.flatten(self.model)
-        start = 0
-        for leaf, positions in self.places:
-            constants = leaves[leaf]
-            size = constants.size
-            count = len(positions)
-            stop = start + count
-            # Each entry of the leaf is one of its constants, or one of the numbers.
-            order = np.arange(size)
-            order[list(positions)] = size + np.arange(count)
-            entries = jnp.concatenate([constants.ravel(), numbers[start:stop]])
-            leaves[leaf] = entries[order].reshape(constants.shape)
-            start = stop
-        model = jax.tree.unflatten(structure, leaves)
-        return getattr(model, self.method)(*arguments)
-
-
-def opened(
-    method: str, model: eqx.Module, *others: eqx.Module
-) -> tuple[OpenModel, AnyArray]:
-    """Return a method with numbers of the model as inputs: traced, or different ones.
-
-    All other numbers stay constants of a program. The numbers are those of each model.
-    """
-    leaves, structure = jax.tree.flatten(model)
-    leaves_of_models = [leaves, *map(jax.tree.leaves, others)]
-    places = []
-    numbers: list[AnyArray] = [np.zeros((len(leaves_of_models), 0))]
-    for k, values in enumerate(zip(*leaves_of_models, strict=True)):
-        first_value, *_ = values
-        if is_traced(values):
-            # All numbers of the leaf are inputs; zeros stand in the closed model.
-            stack = jnp.stack
-            leaves[k] = np.zeros(first_value.shape, first_value.dtype)
-            positions = np.arange(first_value.size)
-        else:
-            stack = np.stack
-            rows = np.array([np.ravel(x) for x in values])
-            is_varying = (rows != rows[0]).any(axis=0)
-            positions = np.flatnonzero(is_varying)
-        if len(positions):
-            variables = [x.ravel()[positions] for x in values]
-            places.append((k, tuple(positions.tolist())))
-            numbers.append(stack(variables))
-    concatenate = jnp.concatenate if is_traced(numbers) else np.concatenate
-    closed_model = jax.tree.unflatten(structure, leaves)
-    open_model = OpenModel(closed_model, method, tuple(places))
-    return open_model, concatenate(numbers, axis=1)
-
-
-def with_open_numbers(model: eqx.Module, method: str) -> tuple[OpenModel, np.ndarray]:
-    """Return a method with the numbers of the model as inputs.
-
-    What is 0, 1 or -1 for all bodies alike stays a constant: other zeros would make the
-    equations of the bodies differ.
-    """
-    places = []
-    numbers = [np.zeros(0)]
-    for k, leaf in enumerate(jax.tree.leaves(model)):
-        if not isinstance(leaf, np.ndarray) or leaf.dtype.kind != "f":
-            continue
-        rows = np.atleast_2d(leaf)
-        rows = rows.reshape(len(rows), -1)
-        is_alike = (rows == rows[0]).all(axis=0)
-        is_constant = is_alike & np.isin(rows[0], (0.0, 1.0, -1.0))
-        is_open = np.isfinite(rows) & ~is_constant
-        positions = np.flatnonzero(is_open)
-        if len(positions):
-            places.append((k, tuple(positions.tolist())))
-            numbers.append(leaf.ravel()[positions])
-    return OpenModel(model, method, tuple(places)), np.concatenate(numbers)
-
-
 MAX_SAMPLES_IN_NUMPY = 4096
 """Number of samples up to which NumPy is faster than compiling and running XLA."""
-PART_NUMBERS = 2**20
-"""Numbers of a result in NumPy that are compiled and computed together.
+PART_NUMBERS = 2**17
+"""Numbers of a result that are computed together on a CPU, without constant zeros.
 
-Their 8 MB of XLA's memory are used again for the next part. XLA's memory for a whole
-regressor would be new in every call, and its pages cost more than the arithmetic; NumPy
-asks for large pages. The compiled function serves every larger number of samples.
+Their 1 MB of XLA's memory stays in the cache and is used again for the next part. XLA's
+memory for a whole regressor would be new in every call, and its pages cost more than
+the arithmetic; NumPy asks for large pages. The compiled function serves every larger
+number of samples.
 """
+ALIGNMENT = 64
+"""Bytes to which memory is aligned that JAX takes without a copy."""
 CACHE_SIZE = 64
 """Number of programs that are kept, of the models that were used last."""
 
@@ -233,6 +153,34 @@ class SampleMethod:
         is_in_loops = self.program.loops is not None
         return self.program.counts.total > LIMITS.program and not is_in_loops
 
+    @functools.cached_property
+    def nonzeros(self) -> np.ndarray:
+        """Positions of the entries that are computed: zeros stay out of a program."""
+        is_nonzero = np.ravel(self.program.nonzeros)
+        return np.flatnonzero(is_nonzero | self.is_long)
+
+    @functools.cached_property
+    def nonzero_runs(self) -> list[tuple[slice, slice]]:
+        """Places of neighbouring nonzeros in the result, and among the nonzeros."""
+        breaks = 1 + np.flatnonzero(np.diff(self.nonzeros) > 1)
+        runs = []
+        start = 0
+        for positions in np.split(self.nonzeros, breaks):
+            if len(positions):
+                stop = start + len(positions)
+                place = slice(positions[0], positions[-1] + 1)
+                runs.append((place, slice(start, stop)))
+                start = stop
+        return runs
+
+    @functools.cached_property
+    def nonzero_program(self) -> Program:
+        """Program of these entries."""
+        program = self._rows
+        if len(self.nonzeros) == len(program.outputs):
+            return program
+        return select_outputs(program, self.nonzeros)
+
     @property
     def output_shape(self) -> Shape:
         """Shape of the result for one sample."""
@@ -252,6 +200,25 @@ class SampleMethod:
         """`over_rows`, compiled."""
         options = None if self.is_long else kernel_options(self.program)
         return jax.jit(self.over_rows, compiler_options=options)
+
+    @property
+    def part_size(self) -> int:
+        """Number of samples that are computed together on a CPU."""
+        numbers = BLOCK * len(self.nonzeros)
+        return BLOCK * max(1, PART_NUMBERS // max(1, numbers))
+
+    @functools.cached_property
+    def compiled_nonzeros(self) -> Callable:
+        """Entries that are not always zero, compiled: [samples, ...]."""
+        if self.nonzero_program is self._rows:
+            return self.compiled
+        run = functools.partial(on_rows, self.nonzero_program)
+        return jax.jit(run, compiler_options=kernel_options(self.program))
+
+    def in_numpy(self, *arrays: AnyArray) -> np.ndarray:
+        """Compute entries that are not always zero in NumPy: [samples, ...]."""
+        results = evaluate(self.nonzero_program, *map(_entries_first, arrays))
+        return results.reshape(-1, results.shape[-1]).T
 
 
 def definition_on_rows(definition: Callable, *arrays: Array) -> Array:
@@ -329,22 +296,27 @@ def on_samples(
 
     # A few samples are done before XLA has compiled; arrays elsewhere stay there.
     devices = set().union(*(x.devices() for x in jax_arrays))
-    platforms = {device.platform for device in devices}
-    is_on_one_cpu = len(devices) <= 1 and platforms <= {"cpu"}
-    samples_count = math.prod(batch)
-    is_small = samples_count <= MAX_SAMPLES_IN_NUMPY and not method.is_long
-    if is_small and is_on_one_cpu:
+    platforms = {device.platform for device in devices} or {jax.default_backend()}
+    is_on_one_cpu = len(devices) <= 1 and platforms == {"cpu"}
+    is_small = math.prod(batch) <= MAX_SAMPLES_IN_NUMPY and not method.is_long
+    if is_small and not jax_arrays:
         columns = [_entries_first(x) for x in arrays]
         results = evaluate(method.program, *columns)
-        results = _samples_first(results, len(batch)).astype(dtype, copy=False)
-        if not jax_arrays:
-            return results
-        with jax.default_device(*devices):
-            return jnp.asarray(results)
+        return _samples_first(results, len(batch)).astype(dtype, copy=False)
 
     has_common_parameters = all(x.ndim == 1 for x in parameters)
-    if has_common_parameters and not jax_arrays and jax.default_backend() == "cpu":
-        return _in_parts(method, batch, parameters, samples, dtype)
+    if is_on_one_cpu and (is_small or has_common_parameters):
+        # What NumPy computes is in parts already.
+        run = method.in_numpy if is_small else method.compiled_nonzeros
+        size = MAX_SAMPLES_IN_NUMPY if is_small else method.part_size
+        device = next(iter(devices), None)
+        with jax.default_device(device):
+            results = _in_parts(method, run, size, batch, parameters, samples, dtype)
+            if not jax_arrays:
+                return results
+            is_committed = any(x.committed for x in jax_arrays)
+            place = device if is_committed else None
+            return jax.device_put(results, place, may_alias=True)
     inputs = [jnp.asarray(x, dtype) for x in arrays]
     results = _over_batches(method.compiled, batch, inputs, len(shared))
     return results if jax_arrays else np.asarray(results)
@@ -352,36 +324,47 @@ def on_samples(
 
 def _in_parts(
     method: SampleMethod,
+    run: Callable,
+    size: int,
     batch: Shape,
     parameters: Sequence[AnyArray],
     samples: Sequence[AnyArray],
     dtype: np.dtype,
 ) -> np.ndarray:
-    """Apply a compiled method to arrays of NumPy, part by part, on a CPU."""
+    """Apply a method to many samples on a CPU, part by part."""
     count = math.prod(batch)
-    numbers = max(1, math.prod(method.output_shape))
-    size = max(1, min(count, max(BLOCK, PART_NUMBERS // numbers)))
-    rows = []
-    for x in samples:
-        entries = x.shape[-1]
-        rows.append(np.broadcast_to(x, (*batch, entries)).reshape(count, entries))
-    results = np.empty((count, *method.output_shape), dtype)
+    arrays = []
+    for k, x in enumerate((*parameters, *samples)):
+        rows = np.asarray(x, dtype)
+        is_common = k < len(parameters) and x.ndim == 1
+        if not is_common:
+            entries = x.shape[-1]
+            rows = np.broadcast_to(rows, (*batch, entries)).reshape(count, entries)
+        arrays.append(rows)
+    results = _aligned_zeros((count, math.prod(method.output_shape)), dtype)
 
-    previous_part = slice(0)
-    previous_values: AnyArray = results[previous_part]
-    for k in range(0, count, size):
-        # The last part begins earlier, so that it is as long as the others.
-        start = min(k, count - size)
-        part = slice(start, start + size)
-        inputs = [x[part] for x in rows]
-        values = method.compiled(
-            *(np.asarray(x, dtype) for x in (*parameters, *inputs))
-        )
-        # While this part is computed, the one before is copied.
-        results[previous_part] = previous_values
-        previous_part, previous_values = part, values
-    results[previous_part] = previous_values
+    def computed_parts():
+        for k in range(0, count, size):
+            # The last part begins earlier, so that it is as long as the others.
+            start = max(0, min(k, count - size))
+            part = slice(start, min(start + size, count))
+            yield part, run(*(x if x.ndim == 1 else x[part] for x in arrays))
+        yield slice(0), results
+
+    # While a part is computed, the one before is copied.
+    for (part, values), _ in itertools.pairwise(computed_parts()):
+        matrix = np.asarray(values).reshape(len(values), -1)
+        for place, entries in method.nonzero_runs:
+            results[part, place] = matrix[:, entries]
     return results.reshape(*batch, *method.output_shape)
+
+
+def _aligned_zeros(shape: Shape, dtype: np.dtype):
+    """Return zeros in memory that JAX takes without a copy."""
+    size = math.prod(shape) * np.dtype(dtype).itemsize
+    memory = np.zeros(size + ALIGNMENT, np.uint8)
+    start = -memory.ctypes.data % ALIGNMENT
+    return memory[start : start + size].view(dtype).reshape(shape)
 
 
 def _batch_shape(arrays: list[AnyArray]):

@@ -58,12 +58,12 @@ def test_numpy_stays_in_numpy_and_jax_in_jax():
     assert isinstance(MODEL.inverse_dynamics(P, in_jax(x)), jax.Array)
 
 
-def test_arrays_of_numpy_are_computed_in_parts(monkeypatch):
+def test_large_results_are_computed_in_parts(monkeypatch):
     monkeypatch.setattr(sample_methods, "MAX_SAMPLES_IN_NUMPY", 0)
     # Of 256 samples: the regressor of 700 has three parts, that of 1400 six.
     monkeypatch.setattr(sample_methods, "PART_NUMBERS", 1)
     method = sample_methods.method_of(MODEL, MODEL.columns, (2,), (2,), (2,))
-    compiled_before = method.compiled._cache_size()
+    compiled_before = method.compiled_nonzeros._cache_size()
     x = motion(1400)
     expected = in_numpy(MODEL, MODEL.columns, x.q, x.qd, x.qdd)
     np.testing.assert_allclose(MODEL.regressor(x), expected, atol=1e-12)
@@ -72,8 +72,15 @@ def test_arrays_of_numpy_are_computed_in_parts(monkeypatch):
     columns = MODEL.regressor(pairs)
     assert type(columns) is np.ndarray
     np.testing.assert_allclose(columns.reshape(expected.shape), expected, atol=1e-12)
-    # One compiled function serves them all.
-    assert method.compiled._cache_size() <= compiled_before + 1
+    # Arrays of JAX stay on their device, and bound to it or not.
+    for device in (None, jax.devices()[-1]):
+        placed = jax.device_put(in_jax(x), device)
+        columns = MODEL.regressor(placed)
+        assert columns.sharding == placed.q.sharding
+        assert columns.committed == placed.q.committed
+        np.testing.assert_allclose(columns, expected, atol=1e-12)
+    # One compiled function serves all of a device.
+    assert method.compiled_nonzeros._cache_size() <= compiled_before + 2
 
 
 @pytest.mark.parametrize("samples", [3, 300])
