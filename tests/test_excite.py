@@ -348,7 +348,7 @@ def test_an_impossible_link_leaves_the_check_of_forces(tmp_path, run):
     assert code == 0, err
     said = " ".join(out.split())
     assert "✓ forces by the nominal" in said
-    assert "! link `l2`: its moments of inertia cannot belong to a real body" in said
+    assert "! link `l2`: the moments of inertia cannot belong to a real body" in said
     # What has no nearest value that can exist is named as the reason.
     path.write_text(possible.replace('<mass value="1"/>', '<mass value="-1"/>'))
     experiment = load_experiment(tmp_path / "arm.toml")

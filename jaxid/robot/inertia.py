@@ -167,7 +167,7 @@ class Inertia(eqx.Module):
         slack = rounding * max(abs(low), abs(high)) + 1e-4 * rounding * mass
         if low < -slack or high > low + middle + slack:
             return (
-                f"its moments of inertia {IMPOSSIBLE}: `inertia` has the principal "
+                f"the moments of inertia {IMPOSSIBLE}: `inertia` has the principal "
                 f"moments {low:.3g}, {middle:.3g}, {high:.3g} kg m², of which one is "
                 "negative, or larger than the sum of the others"
             )

@@ -451,15 +451,17 @@ def _negative_notes(tree: UrdfTree):
 def _inertial_notes(tree: UrdfTree):
     """Return notes on bodies without mass, and on links that cannot exist."""
     masses = np.zeros(len(tree.joints))
-    faults = {}
+    links_by_fault = {}
     rounded_links = []
     for link, placement in tree.carriers.items():
         inertia_and_fault = tree.inertial(link) if placement.body >= 0 else None
         if inertia_and_fault is None:
             continue
-        inertia, faults[link] = inertia_and_fault
+        inertia, fault = inertia_and_fault
         masses[placement.body] += abs(inertia.mass)
-        if not faults[link] and inertia.nearest_possible() is not inertia:
+        if fault:
+            links_by_fault.setdefault(fault, []).append(link)
+        elif inertia.nearest_possible() is not inertia:
             rounded_links.append(link)
     notes = []
     if rounded_links:
@@ -476,20 +478,18 @@ def _inertial_notes(tree: UrdfTree):
             f"{owners('joint', light_bodies)}: "
             "the body has no mass; `urdf_parameters` takes zero."
         )
-    for link, fault in faults.items():
-        if fault:
-            # Only moments have a nearest value that can exist.
-            use = (
-                "the nearest possible values are used as the prior and to check forces"
-            )
-            if IMPOSSIBLE not in fault:
-                use = f"it {IMPOSSIBLE}, so the inertias of the file are not used"
-            notes.append(f"link `{link}`: {fault}; {use}: correct its inertial.")
+    for fault, links in links_by_fault.items():
+        # Only moments have a nearest value that can exist.
+        use = "the nearest possible values are used as the prior and to check forces"
+        if IMPOSSIBLE not in fault:
+            use = f"it {IMPOSSIBLE}, so the inertias of the file are not used"
+        names = owners("link", links)
+        notes.append(f"{names}: {fault}; {use}: correct the inertial.")
     bodies = tree.bodies()
     densities = ball_densities(bodies)
     joints = tree.joints[-len(bodies) :]
     dense_bodies = np.flatnonzero(densities > MAX_DENSITY)
-    if dense_bodies.size and not any(faults.values()):
+    if dense_bodies.size and not links_by_fault:
         names = owners("joint", [joints[i].get("name") for i in dense_bodies])
         notes.append(
             f"{names}: mass and moments of the body {IMPOSSIBLE}: "

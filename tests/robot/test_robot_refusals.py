@@ -304,10 +304,28 @@ def test_inertials_that_cannot_exist_are_noted_and_not_used(tmp_path, case):
     with pytest.raises(InputError, match=f"link `a` .*{sentence}"):
         urdf_parameters(path)
     (remark,) = load_urdf(path).remarks
-    assert re.search(f"link `a`: .*{sentence}.*correct its inertial", remark.text)
+    assert re.search(f"link `a`: .*{sentence}.*correct the inertial", remark.text)
     assert "cannot belong to a real body" in remark.text
     assert remark.status is Status.DOUBTFUL
     assert urdf_parameters(path, check=False)[0] == claimed[0]
+
+
+def test_links_with_one_fault_share_a_remark(tmp_path):
+    path = tmp_path / "arm.urdf"
+    placeholder = inertial(
+        1e-6, (0, 0, 0), (0, 0, 0), (1e-6, 1e-6, 1e-6, 1e-6, 1e-6, 1e-6)
+    )
+    path.write_text(
+        robot(
+            link("base"),
+            link("a", placeholder),
+            joint("j1", "base", "a"),
+            link("b", placeholder),
+            joint("j2", "a", "b"),
+        )
+    )
+    (remark,) = load_urdf(path).remarks
+    assert "links `a`, `b`: the moments of inertia cannot belong" in remark.text
 
 
 @pytest.mark.parametrize(
