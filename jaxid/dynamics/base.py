@@ -334,11 +334,19 @@ def _doubts(
         )
     if dependence.smallest_independent < MIN_SHARE:
         column = dependence.independent[int(np.argmin(regrouped_columns.shares))]
+        reason = (
+            "due to a length near zero or an angle like 1.571 instead of pi/2, which "
+            "`robot.snapped(1e-3)` (`snap_tolerance`) makes exact."
+        )
+        if model.robot.loops:
+            reason = (
+                "as the closed loops let the joints move only a little; expect a wide "
+                "interval for it, which does no harm to torques."
+            )
         yield (
             f"`{model.parameter_names[column]}` is barely a base parameter: only "
-            f"{dependence.smallest_independent:.1e} of its column is independent, due "
-            "to a length near zero or an angle like 1.571 instead of pi/2, which "
-            "`robot.snapped(1e-3)` (`snap_tolerance`) makes exact."
+            f"{dependence.smallest_independent:.1e} of its column is independent, "
+            f"{reason}"
         )
     if dependence.dependent and dependence.gap < MIN_GAP:
         yield (

@@ -15,7 +15,7 @@ import scipy
 
 from jaxid.arrays import AnyArray, Float
 from jaxid.program.sample_methods import in_numpy
-from jaxid.robot.joint_coordinates import reachable
+from jaxid.robot.loop_closing import reachable
 from jaxid.units.dimensions import length_power
 
 from .model import Model

@@ -17,8 +17,8 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.packed_regressor import JointRegressor
 from jaxid.errors import InputError
-from jaxid.robot.joint_coordinates import reachable
 from jaxid.robot.limits_and_drives import Limits
+from jaxid.robot.loop_closing import reachable
 from jaxid.robot.robot import Robot
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.trajectory import AbstractBasis, LinearTrajectory

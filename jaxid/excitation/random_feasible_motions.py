@@ -11,7 +11,7 @@ import numpy as np
 
 from jaxid.arrays import Float
 from jaxid.dynamics.motion import Motion
-from jaxid.robot.joint_coordinates import reachable
+from jaxid.robot.loop_closing import reachable
 
 from .coefficient_limits import FILLED_FRACTION, Grid, ScaledMotions
 from .criterion_gradient import criterion_at_samples

@@ -18,7 +18,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, atomic_folder, fill_template
 from jaxid.program import Program, evaluate, trace
 from jaxid.program.c_writer import CWriter
-from jaxid.robot.joint_coordinates import reachable
+from jaxid.robot.loop_closing import reachable
 from jaxid.robot.robot import Robot
 
 from .feed_forward import other_forces, torques

@@ -10,8 +10,8 @@ from jaxid.arrays import AnyArray, Indices, Joints, Matrix
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.result_table import Status
-from jaxid.robot.joint_coordinates import reachable
 from jaxid.robot.limits_and_drives import complete_limits
+from jaxid.robot.loop_closing import reachable
 
 from .estimators.regularisation_and_weights import Complete, Decomposition
 from .factors import Blocks

@@ -11,7 +11,7 @@ from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.program.sample_methods import in_numpy
 from jaxid.result_table import Summarised, Table
-from jaxid.robot.joint_coordinates import reachable
+from jaxid.robot.loop_closing import reachable
 
 from .combination import as_least_squares, combine, replace_estimates, require_same_base
 from .fit_result import Fit, interval_table

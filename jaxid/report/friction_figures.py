@@ -10,7 +10,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.program.sample_methods import in_numpy
 from jaxid.result_table import significant
 from jaxid.robot.collision_geometry import BodyShape
-from jaxid.robot.joint_coordinates import reachable
+from jaxid.robot.loop_closing import reachable
 from jaxid.validation.torque_errors import TorqueErrors
 
 from .figure import Figure

@@ -13,8 +13,8 @@ from jaxid.arrays import AnyArray, Array, Float, Hashable, Joints, double_precis
 from jaxid.errors import InputError
 
 from .forward_kinematics import placements
-from .joint_coordinates import reachable
 from .limits_and_drives import complete_limits
+from .loop_closing import reachable
 from .robot import Robot
 from .shapes import GROUND, Box, Capsule, HalfSpace, segment_distance
 
@@ -34,8 +34,9 @@ class CollisionModel(Hashable):
         capsules: Capsules with different names.
         obstacles: Obstacles with different names.
         pairs: Names of shapes to watch. If None: all pairs but those of one body, of
-            neighbouring bodies, of the ground with itself, and those that overlap in
-            each of 400 random poses, which the notes list.
+            neighbouring bodies, which a joint or a loop joins, of the ground with
+            itself, and those that overlap in each of 400 random poses, which the notes
+            list.
 
     Attributes:
         pairs: Indices of shapes to watch against each other: of a capsule and of
@@ -321,18 +322,17 @@ def _meeting_pairs(
     capsules: Sequence[Capsule],
     obstacles: int,
 ):
-    """Return the pairs of shapes on bodies that are neither one nor neighbours."""
+    """Return the pairs of shapes on bodies that are neither one nor neighbours.
+
+    Neighbours are joined by a joint, or pinned together by a loop.
+    """
     bodies = [capsule.body for capsule in capsules]
-    links = set(enumerate(robot.parent))
+    neighbours = {frozenset(link) for link in enumerate(robot.parent)}
+    neighbours |= {frozenset(loop.bodies) for loop in robot.loops}
     pairs = []
     for i, k in itertools.combinations(range(len(capsules)), 2):
-        first_body = bodies[i]
-        second_body = bodies[k]
-        are_neighbours = (first_body, second_body) in links or (
-            second_body,
-            first_body,
-        ) in links
-        if first_body != second_body and not are_neighbours:
+        pair = frozenset((bodies[i], bodies[k]))
+        if len(pair) == 2 and pair not in neighbours:
             pairs.append((i, k))
     # An obstacle is not part of the base that carries the first body.
     for i, body in enumerate(bodies):

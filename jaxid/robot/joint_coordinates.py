@@ -10,7 +10,7 @@ closing the loops.
 """
 
 import functools
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -24,56 +24,25 @@ from jaxid.arrays import (
     ManyJoints,
     Matrix,
     Matrix3,
-    Numbers,
     Vector3,
-    as_array,
-    is_traced,
     namespace,
 )
-from jaxid.errors import InputError
-from jaxid.program.sample_methods import in_numpy, on_samples
 
-from .follower_joints import Followers, Loop, chain_to_ground
+from .follower_joints import Followers, Loop, bodies_in_loop, chain_to_ground
 from .rotations import rotation_about
 
-PARTS_OF_WAY = 24
-"""Points on the way to random coordinates at which it is checked."""
-
-
-class ClosingSteps(NamedTuple):
-    """Newton's steps that close loops.
-
-    Attributes:
-        parts: Parts of the motors' way from the robot's `loop_pose`, with one step
-            each. If 0, the loops start where they would be if their coordinates were
-            quadratic functions of the motors'.
-        last: Steps behind this way.
-    """
-
-    parts: int
-    last: int
-
-
-QUICK = ClosingSteps(0, 4)
-"""Steps for many samples: sines and cosines of all steps take most of the time."""
-STANDARD = ClosingSteps(8, 6)
-"""Steps for one sample in a program, and for samples that the quick ones miss."""
-THOROUGH = ClosingSteps(24, 6)
-"""Steps for samples whose loops do not close by the standard ones."""
+PARTS_OF_WAY = 8
+"""Parts of the motors' way from `loop_pose`, each with a step that closes the loops."""
+LAST_STEPS = 6
+"""Steps behind this way."""
 MAX_CHANGE = 0.5
 """Largest change of a joint in one of these steps [rad or m]."""
-MAX_GAP = {"float64": 1e-12, "float32": 1e-4}
-"""Distance between two points of a loop up to which it is closed, by precision [m]."""
-MAX_QUICK_GAP = 1e-7
-"""Distance that the last of the quick steps still closes, as it squares it [m]."""
-MAX_QUICK_WAY = 1.0
-"""Way of a motor from the robot's `loop_pose` up to which they are used [rad or m]."""
-MIN_CLOSING_SHARE = 1e-4
-"""Determinant of closing relative to that of the description; below, it is singular."""
-MIN_SAFE_SHARE = 0.2
-"""The same for motions that are designed or drawn."""
+MAX_JOINTS_OF_COFACTORS = 3
+"""Joints that loops move up to which cofactors solve for them: fewer operations."""
 SMALLEST_SQUARE = 1e-24
 """Added to squares of columns [m²]: at a singular pose, steps are large but finite."""
+SMALLEST_SQUARE_OF_DETERMINANT = 1e-36
+"""Added to squares of determinants, for the same."""
 
 
 def placement_in_parent(
@@ -155,14 +124,8 @@ def all_accelerations(robot: Any, q: Joints, qd: Joints, qdd: Joints) -> AnyArra
         return accelerations
     coordinates = all_coordinates(robot, q)
     rates = all_rates(robot, q, qd)
-
-    def gap_rates(coordinates):
-        gaps = functools.partial(closing_rows, robot)
-        return jax.jvp(gaps, (coordinates,), (rates,))[1]
-
-    _, gap_accelerations = jax.jvp(gap_rates, (coordinates,), (rates,))
     free_slopes, slopes = gap_slopes(robot, coordinates)
-    bias = solve_columns(slopes, -gap_accelerations)
+    bias = solve_columns(slopes, -_gap_curvature(robot, coordinates, rates))
     other_joints = free_slopes.shape[1]
     return accelerations + jnp.pad(bias, (other_joints, 0))
 
@@ -230,79 +193,136 @@ def _place_on(robot: Any, coordinates: Joints, body: int, point: Vector3, carrie
     return point
 
 
-@functools.partial(jax.custom_jvp, nondiff_argnums=(2,))
-def closed_coordinates(robot: Any, q: Joints, steps: ClosingSteps = STANDARD) -> Array:
-    """Return the coordinates of all joints, at which the loops are closed.
+def closed_coordinates(robot: Any, q: Joints) -> AnyArray:
+    """Return the coordinates of all joints of one sample, where the loops are closed.
 
     The motors go to their coordinates in equal parts, and the loops follow: so they
     stay on their branch. Where no loops close, they are open: see `loop_closure`.
     """
-    joints = len(robot.loop_rows)
+    change = change_of_motors(robot, q)
+
+    def step(k, moved):
+        others = coordinates_on_way(robot, q, change, (k + 1) / PARTS_OF_WAY)
+        return moved + newton_step(robot, jnp.concatenate([others, moved]))
+
     pose = jnp.asarray(robot.loop_pose, q.dtype)
-    start = pose[: robot.joints]
-    change = q - start
-    loop_coordinates = pose[-joints:]
-    if not steps.parts:
-        loop_coordinates = _extrapolated(robot, pose, change)[-joints:]
-    elif robot.bodies == robot.joints + joints:
-        # A full turn of a motor changes nothing, if no joint follows it by a ratio.
-        turn = jnp.arctan2(jnp.sin(change), jnp.cos(change))
-        change = jnp.where(np.array(robot.revolute), turn, change)
-    end = start + change if steps.parts else q
-
-    def step(k, loop_coordinates):
-        # Behind the way these are exactly the motors' coordinates, whose sines and
-        # cosines are computed once.
-        rest = 1.0 - jnp.minimum((k + 1) / max(steps.parts, 1), 1.0)
-        other_coordinates = linear_coordinates(robot.followers, end - rest * change)
-        coordinates = jnp.concatenate([other_coordinates, loop_coordinates])
-        return loop_coordinates + _newton_step(robot, coordinates)
-
-    loop_coordinates = jax.lax.fori_loop(0, sum(steps), step, loop_coordinates)
-    other_coordinates = linear_coordinates(robot.followers, q)
-    return jnp.concatenate([other_coordinates, loop_coordinates])
+    moved = pose[-len(robot.loop_rows) :]
+    moved = jax.lax.fori_loop(0, PARTS_OF_WAY + LAST_STEPS, step, moved)
+    others = linear_coordinates(robot.followers, q)
+    return with_loop_rates(robot, q, jnp.concatenate([others, moved]))
 
 
-def _newton_step(robot: Any, coordinates: Joints):
+def change_of_motors(robot: Any, q: ManyJoints) -> AnyArray:
+    """Return how far motors are from the robot's `loop_pose`, on the shortest way."""
+    xp = namespace(q)
+    pose = xp.asarray(robot.loop_pose, q.dtype)[: robot.joints]
+    change = q - xp.broadcast_to(pose, q.shape)
+    if robot.bodies > robot.joints + len(robot.loop_rows):
+        return change
+    # A full turn of a motor changes nothing, if no joint follows it by a ratio.
+    turn = xp.arctan2(xp.sin(change), xp.cos(change))
+    is_revolute = np.broadcast_to(np.array(robot.revolute), q.shape)
+    return xp.where(is_revolute, turn, change)
+
+
+def coordinates_on_way(
+    robot: Any, q: ManyJoints, change: AnyArray, share: Any
+) -> AnyArray:
+    """Return all coordinates but those of loops after a share of the motors' way.
+
+    Behind the way these are exactly those of `q`, whose sines and cosines a program
+    computes once.
+    """
+    xp = namespace(q, share)
+    rest = 1.0 - xp.minimum(share, 1.0)
+    return linear_coordinates(robot.followers, q - rest * change)
+
+
+def newton_step(robot: Any, coordinates: Joints) -> Array:
     """Return the changes of the joints that loops move, which close them."""
     _, slopes = gap_slopes(robot, coordinates)
     change = solve_columns(slopes, -closing_rows(robot, coordinates))
-    return jnp.minimum(jnp.maximum(change, -MAX_CHANGE), MAX_CHANGE)
+    return _limited(change, MAX_CHANGE)
 
 
-def _extrapolated(robot: Any, pose: Joints, change: Joints) -> AnyArray:
-    """Return the coordinates of all joints to second order around a closed pose."""
-    robot, start = at_sample(robot, pose)
-    rates = all_rates(robot, start, change)
-    curvature = all_accelerations(robot, start, change, jnp.zeros_like(change))
-    return pose + rates + curvature / 2
+def chebyshev_step(robot: Any, coordinates: Joints) -> Array:
+    """Return these changes to third order: with the curvature along Newton's step."""
+    step = newton_step(robot, coordinates)
+    _, slopes = gap_slopes(robot, coordinates)
+    others = robot.bodies - len(step)
+    curvature = _gap_curvature(robot, coordinates, jnp.pad(step, (others, 0)))
+    correction = solve_columns(slopes, curvature) / 2
+    return step - _limited(correction, jnp.sqrt(step @ step) / 2)
 
 
-@closed_coordinates.defjvp
-def _closed_rates(steps: ClosingSteps, primals: tuple, tangents: tuple):
+def _limited(change: Array, limit: Any):
+    """Return changes of joints that are not too large."""
+    return jnp.minimum(jnp.maximum(change, -limit), limit)
+
+
+def _gap_curvature(robot: Any, coordinates: Joints, rates: Joints):
+    """Return the second derivatives of `closing_rows` at constant rates."""
+
+    def gap_rates(coordinates):
+        gaps = functools.partial(closing_rows, robot)
+        return jax.jvp(gaps, (coordinates,), (rates,))[1]
+
+    return jax.jvp(gap_rates, (coordinates,), (rates,))[1]
+
+
+def extrapolated_coordinates(robot: Any, change: Joints) -> AnyArray:
+    """Return those of all joints to third order around the robot's `loop_pose`."""
+    pose = jnp.asarray(robot.loop_pose, change.dtype)
+    closed_robot, start = at_sample(robot, pose)
+    rates = all_rates(closed_robot, start, change)
+    standstill = jnp.zeros_like(change)
+    curvature = all_accelerations(closed_robot, start, change, standstill)
+
+    def derivative(gaps):
+        return lambda t: jax.jvp(gaps, (t,), (jnp.ones_like(t),))[1]
+
+    def gaps_on_way(t):
+        return closing_rows(robot, pose + t * rates + t * t * curvature / 2)
+
+    gap_jerk = derivative(derivative(derivative(gaps_on_way)))(jnp.zeros_like(pose[0]))
+    _, slopes = gap_slopes(robot, pose)
+    jerk = solve_columns(slopes, -gap_jerk)
+    others = robot.bodies - len(jerk)
+    return pose + rates + curvature / 2 + jnp.pad(jerk, (others, 0)) / 6
+
+
+@jax.custom_jvp
+def with_loop_rates(robot: Any, q: Joints, coordinates: Joints) -> Joints:
+    """Return coordinates that close the loops, with their derivatives by `q`."""
+    return coordinates
+
+
+@with_loop_rates.defjvp
+def _loop_rates(primals: tuple, tangents: tuple):
     """Return the coordinates and their rates, by the implicit function theorem."""
-    robot, _ = primals
-    coordinates = closed_coordinates(*primals, steps)
-    joints = len(robot.loop_rows)
-    loop_coordinates = coordinates[-joints:]
+    robot, q, _ = primals
+    coordinates = with_loop_rates(*primals)
+    moved = coordinates[-len(robot.loop_rows) :]
 
     def open_loops(robot, q):
-        other_coordinates = linear_coordinates(robot.followers, q)
-        open_coordinates = jnp.concatenate([other_coordinates, loop_coordinates])
-        return closing_rows(robot, open_coordinates), other_coordinates
+        others = linear_coordinates(robot.followers, q)
+        return closing_rows(robot, jnp.concatenate([others, moved])), others
 
-    _, (gap_rates, other_rates) = jax.jvp(open_loops, primals, tangents)
+    _, (gap_rates, other_rates) = jax.jvp(open_loops, (robot, q), tangents[:2])
     _, slopes = gap_slopes(robot, coordinates)
-    loop_rates = solve_columns(slopes, -gap_rates)
-    return coordinates, jnp.concatenate([other_rates, loop_rates])
+    return coordinates, jnp.concatenate(
+        [other_rates, solve_columns(slopes, -gap_rates)]
+    )
 
 
 def solve_columns(A: Array, b: Array) -> Array:
-    """Solve $A x = b$ by orthogonal columns, without square roots or pivoting.
+    """Solve $A x = b$ by cofactors or orthogonal columns, without roots or pivoting.
 
     A program has no loops, and no order of rows that is good in all poses.
     """
     n = len(A)
+    if n <= MAX_JOINTS_OF_COFACTORS:
+        return _solve_by_cofactors(A, b)
     columns = [A[:, j] for j in range(n)]
     products = {}
     solution = []
@@ -320,14 +340,16 @@ def solve_columns(A: Array, b: Array) -> Array:
     return jnp.stack(solution)
 
 
-def determinant(A: Array) -> Array:
-    """Return the determinant of a matrix near the identity, by elimination."""
-    pivots = []
-    while len(A):
-        pivots.append(A[0, 0])
-        factors = A[1:, 0] / A[0, 0]
-        A = A[1:, 1:] - factors[:, None] * A[:1, 1:]
-    return jnp.prod(jnp.stack(pivots))
+def _solve_by_cofactors(A: Array, b: Array):
+    """Solve at most three equations by Cramer's rule."""
+    n = len(A)
+    missing = MAX_JOINTS_OF_COFACTORS - n
+    ones = np.diag([0.0] * n + [1.0] * missing)
+    x, y, z = jnp.pad(A, (0, missing)).T + jnp.asarray(ones, A.dtype)
+    cofactors = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)])
+    value = x @ cofactors[0]
+    factor = value / (value * value + SMALLEST_SQUARE_OF_DETERMINANT)
+    return jnp.tensordot(cofactors[:n, :n], b, 1) * factor
 
 
 def loop_closure(robot: Any, coordinates: Joints) -> Array:
@@ -338,118 +360,42 @@ def loop_closure(robot: Any, coordinates: Joints) -> Array:
     another branch.
     """
     gaps = loop_gaps(robot, coordinates)
-    _, slopes = gap_slopes(robot, coordinates)
     pose = jnp.asarray(robot.loop_pose, coordinates.dtype)
-    _, slopes_of_pose = gap_slopes(robot, pose)
-    share = determinant(solve_columns(slopes_of_pose, slopes))
+    share = _determinant(robot, coordinates) / _determinant(robot, pose)
     return jnp.stack([gaps @ gaps, share])
 
 
-class Closure(eqx.Module):
-    """Closing of the loops of a robot."""
+def _determinant(robot: Any, coordinates: Joints):
+    """Return the determinant of the slopes by the joints that loops move.
 
-    robot: Any
-    steps: ClosingSteps = eqx.field(static=True, default=STANDARD)
-
-    def of_sample(self, q: Joints) -> Array:
-        """Return the coordinates of all joints of one sample, and `loop_closure`."""
-        robot = self.robot
-        coordinates = closed_coordinates(robot, q, self.steps)
-        closure = loop_closure(robot, coordinates)
-        if self.steps is QUICK:
-            # What the closure has computed gives one more step.
-            change = _newton_step(robot, coordinates)
-            others = jnp.zeros(robot.bodies - len(change))
-            coordinates = coordinates + jnp.concatenate([others, change])
-        return jnp.concatenate([coordinates, closure])
-
-    def of_samples(self, q: ManyJoints) -> AnyArray:
-        """Return the same of many samples; in float64 for NumPy's arrays."""
-        if not isinstance(q, np.ndarray):
-            return on_samples(self, self.of_sample, q)
-        rows = in_numpy(self, self.of_sample, q.reshape(-1, self.robot.joints))
-        return rows.reshape(*q.shape[:-1], -1)
-
-
-def close_loops(robot: Any, q: Numbers) -> ManyJoints:
-    """Return the coordinates of all joints; see `Robot.close`."""
-    q = as_array("q", q)
-    if q.shape[-1:] != (robot.joints,):
-        raise InputError(
-            f"`q` must have {robot.joints} joints along its last axis, but has shape "
-            f"{q.shape}."
-        )
-    if not robot.loops:
-        return linear_coordinates(robot.followers, q)
-    if isinstance(q, np.ndarray):
-        closure = Closure(robot, QUICK).of_samples(q)
-        is_closed = _is_quickly_closed(robot, q, closure)
-        for steps in (STANDARD, THOROUGH):
-            if not is_closed.all():
-                is_open = ~is_closed
-                closure[is_open] = Closure(robot, steps).of_samples(q[is_open])
-                is_closed = _is_closed(closure)
-    else:
-        closure = Closure(robot).of_samples(q)
-        is_closed = _is_closed(closure)
-    coordinates = closure[..., : robot.bodies]
-    if is_traced(closure):
-        return jnp.where(is_closed[..., None], coordinates, jnp.nan)
-    if not np.all(is_closed):
-        sample = int(np.argmin(np.ravel(is_closed)))
-        pose = np.asarray(q).reshape(-1, robot.joints)[sample]
-        raise _open_error(
-            robot, sample, pose, float(np.sqrt(closure[..., -2].ravel()[sample]))
-        )
-    return coordinates
-
-
-def _is_closed(closure: AnyArray, min_share: float = MIN_CLOSING_SHARE):
-    """Return whether loops close, on the branch of the description."""
-    max_gap = MAX_GAP[closure.dtype.name]
-    return (closure[..., -2] <= max_gap**2) & (closure[..., -1] > min_share)
-
-
-def _is_quickly_closed(robot: Any, q: np.ndarray, closure: AnyArray):
-    """Return whether quick steps surely close loops, and as precisely as others."""
-    start = np.asarray(robot.loop_pose)[: robot.joints]
-    is_near = np.abs(q - start).max(axis=-1) <= MAX_QUICK_WAY
-    is_precise = closure[..., -2] <= MAX_QUICK_GAP**2
-    return _is_closed(closure, MIN_SAFE_SHARE) & is_near & is_precise
-
-
-def reachable(robot: Any, q: np.ndarray) -> np.ndarray:
-    """Return the last coordinates on the way from `loop_pose` that loops reach safely.
-
-    They do not pass a singular pose, behind which a loop may close in two ways.
-
-    Args:
-        robot: Robot, which may have no loops.
-        q: Coordinates of the joints that move alone, such as random ones.
+    It is expanded along the rows. Each of them has slopes by the joints of one loop
+    only, so that few minors differ from zero.
     """
-    if not robot.loops:
-        return q
-    start = np.asarray(robot.loop_pose)[: robot.joints]
-    way = np.asarray(q, np.float64) - start
-    shares = np.zeros(way.shape[:-1])
-    for part in range(1, PARTS_OF_WAY + 1):
-        share = part / PARTS_OF_WAY
-        closure = Closure(robot).of_samples(start + share * way)
-        is_safe = _is_closed(closure, MIN_SAFE_SHARE)
-        is_reached = shares == (part - 1) / PARTS_OF_WAY
-        shares[is_safe & is_reached] = share
-    return start + shares[..., None] * way
+    _, slopes = gap_slopes(robot, coordinates)
+    joints = _moved_joints_of_rows(robot)
+    minors: dict[frozenset[int], Any] = {frozenset(): 1.0}
+    for row, columns in enumerate(joints):
+        in_later_rows = set().union(*joints[row + 1 :])
+        needed = set(range(len(joints))) - in_later_rows
+        larger_minors: dict[frozenset[int], Any] = {}
+        for minor, value in minors.items():
+            for column in columns - minor:
+                key = minor | {column}
+                if not key >= needed:
+                    continue
+                swaps = sum(other > column for other in minor)
+                term = (-1.0) ** swaps * slopes[row, column] * value
+                larger_minors[key] = larger_minors.get(key, 0.0) + term
+        minors = larger_minors
+    return minors[frozenset(range(len(joints)))]
 
 
-def _open_error(robot: Any, sample: int, pose: np.ndarray, distance: float):
-    """Return the error of a motion whose loops do not close at a sample."""
-    positions = ", ".join(f"{x:.4g}" for x in pose)
-    loops = ", ".join(f"`{loop.name}`" for loop in robot.loops)
-    fault = f"the points of {loops} stay {distance:.3g} m apart"
-    if distance <= MAX_GAP["float32"]:
-        fault = f"{loops} would have to pass a singular pose"
-    return InputError(
-        f"the loops of `{robot.name}` do not close at sample {sample}, where "
-        f"{', '.join(robot.joint_names)} are at {positions}: {fault}; keep `q` within "
-        "the reach of the mechanism, on the branch of the description."
-    )
+def _moved_joints_of_rows(robot: Any):
+    """Return for each of `closing_rows` the joints that its loop moves."""
+    others = robot.bodies - len(robot.loop_rows)
+    joints = []
+    for row in robot.loop_rows:
+        loop = robot.loops[row // 3]
+        bodies = bodies_in_loop(robot.parent, loop.bodies)
+        joints.append({body - others for body in bodies if body >= others})
+    return joints

@@ -26,8 +26,8 @@ from jaxid.result_table import Column, Remark, Status, Summarised, Table
 from .contacts import Contact, Imu
 from .follower_joints import Followers, Loop, order_from_ground
 from .inertia import IMPOSSIBLE, Tool
-from .joint_coordinates import close_loops
 from .limits_and_drives import MAX_LENGTH, Drives, Limits, length_notes, limit_notes
+from .loop_closing import close_loops
 from .rotations import (
     SNAP_TOLERANCE,
     as_rotations,

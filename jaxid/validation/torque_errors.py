@@ -23,7 +23,7 @@ from jaxid.result_table import (
     Table,
     percent,
 )
-from jaxid.robot.joint_coordinates import reachable
+from jaxid.robot.loop_closing import reachable
 
 POSES = 2000
 """Random poses in which the mass matrix is evaluated."""

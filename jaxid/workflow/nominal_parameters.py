@@ -12,8 +12,8 @@ from jaxid.errors import InputError
 from jaxid.excitation.constraints import ForceLimits
 from jaxid.report.result_files import read_fit
 from jaxid.robot.inertia import IMPOSSIBLE
-from jaxid.robot.joint_coordinates import reachable
 from jaxid.robot.limits_and_drives import complete_limits
+from jaxid.robot.loop_closing import reachable
 from jaxid.robot.robot import Robot
 
 from .excitation_settings import Excitation

@@ -150,7 +150,15 @@ def test_loops_keep_their_branch_and_name_the_sample_that_does_not_close(tmp_pat
     q = np.stack([t, 1.4 + u, 0.1 + c], axis=-1)
     # The other branch of the parallelogram has crossed bars.
     np.testing.assert_allclose(robot.close(q)[:, 3], q[:, 2] - q[:, 1], atol=1e-9)
-    np.testing.assert_allclose(jax.jit(robot.close)(q)[:, 3], q[:, 2] - q[:, 1])
+    compiled = jax.jit(robot.close)
+    np.testing.assert_allclose(compiled(q)[:, 3], q[:, 2] - q[:, 1])
+    # Turned far, loops are followed on the way, and so are they one by one.
+    far = q + np.array([2.5, 0.0, 0.0])
+    np.testing.assert_allclose(robot.close(far)[:, 3], q[:, 2] - q[:, 1], atol=1e-9)
+    each = jax.jit(jax.vmap(robot.close))(far)
+    np.testing.assert_allclose(each, robot.close(far), atol=1e-9)
+    slopes = jax.jit(jax.vmap(jax.jacrev(robot.close)))(q)
+    np.testing.assert_allclose(slopes[:, 3], np.tile([0.0, -1.0, 1.0], (50, 1)))
     path.write_text(MECHANISMS["five-bar"].text)
     robot = jid.load_mjcf(path)
     q = np.array([[2.2, 0.9], [3.1, 0.0]])
@@ -261,6 +269,17 @@ def test_a_body_that_a_weld_joins_is_that_of_a_joint(tmp_path):
         mujoco.mj_forward(model, data)
         # The three forces and three turns of the constraint.
         np.testing.assert_allclose(data.efc_pos[:6], 0.0, atol=1e-9)
+
+
+@pytest.mark.parametrize("mechanism", [MECHANISMS["five-bar"]])
+def test_bodies_that_a_loop_pins_together_may_touch(path):
+    robot = jid.load_mjcf(path)
+    rods = [
+        jid.collision.Capsule(name, body, start=(0, 0, 0), end=(0.3, 0, 0), radius=0.02)
+        for body, name in enumerate(robot.body_names)
+    ]
+    model = jid.collision.CollisionModel(robot, rods)
+    assert set(model.pair_names) == {"a1 and b1", "a1 and b2", "b1 and a2"}
 
 
 @pytest.mark.parametrize("mechanism", [MECHANISMS["palletiser"]])

@@ -6,11 +6,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Joints
 from jaxid.program.sample_methods import evaluate_samples
-from jaxid.robot.joint_coordinates import (
-    MIN_SAFE_SHARE,
-    Closure,
-    all_rates,
-)
+from jaxid.robot.joint_coordinates import all_rates
+from jaxid.robot.loop_closing import MIN_SAFE_SHARE, Closure
 from jaxid.robot.robot import Robot
 
 from .clearance import SIZE
