@@ -34,6 +34,7 @@ ROBOTS = Path(pin.__file__).parents[4] / "share/example-robot-data/robots"
 STEP = 0.001
 PHASE = 8.0  # duration of a phase: all feet stand, or one is lifted [s]
 RECORD_STEPS = 4
+CONTROL_STEP = 0.005  # cycle of the controllers of the joints [s]
 SAMPLE_TIME = RECORD_STEPS * STEP
 NOISE = {"angles": 2e-4, "forces": 0.1, "gyro": 0.01, "accelerometer": 0.1}
 FILTER = jid.ZeroPhaseButterworth(10.0)
@@ -253,6 +254,28 @@ class Plan:
             self.q[1 + leg] += np.linalg.solve(damped, J.T @ error)
 
 
+class Designed:
+    """Reference of the joints from a designed motion, as a controller takes it."""
+
+    def __init__(self, robot: Legged, motion: Any):
+        names = [*robot.pinned().names][2:]
+        order = [robot.load().joint_names[6:].index(name) for name in names]
+        times = np.arange(0.0, float(motion.duration) + CONTROL_STEP, CONTROL_STEP)
+        samples = motion.motion(times)
+        self.robot = robot
+        self.angles = np.asarray(samples.q)[:, order]
+        self.rates = np.asarray(samples.qd)[:, order]
+        self.stand = np.r_[np.zeros(7), self.angles[0]]
+
+    def torques(self, d: Any, t: float) -> np.ndarray:
+        """Return the torques of the drives, which follow angles and velocities."""
+        robot = self.robot
+        k = min(int(t / CONTROL_STEP + 1e-6), len(self.angles) - 1)
+        torque = robot.stiffness * (self.angles[k] - d.qpos[7:])
+        torque += robot.rate_gain * (self.rates[k] - d.qvel[6:])
+        return np.clip(torque, -robot.torque, robot.torque)
+
+
 def simulate(
     robot: Legged,
     seed: int,
@@ -260,15 +283,21 @@ def simulate(
     *,
     load: pin.Inertia | None = None,
     lifted_feet: Sequence[int] = range(4),
+    motion: Any = None,
 ) -> dict[str, np.ndarray]:
-    """Return the channels of a log without noise, and how upright the base was.
+    """Return the channels of a log without noise, attitude of the base, and feet.
 
-    Torques are those that MuJoCo's actuators applied, at the instants of the angles.
+    Torques are those that MuJoCo's actuators applied, at the instants of the angles. A
+    `motion` is followed in place of the plan of a seed.
     """
     pinned = robot.pinned()
     if load is not None:
         pinned.inertias[1] = pinned.inertias[1] + load
-    plan: Any = Plan(robot, robot.pinned(), seed, lifted_feet)
+    plan: Any = None
+    if motion is None:
+        plan = Plan(robot, robot.pinned(), seed, lifted_feet)
+    else:
+        plan = Designed(robot, motion)
     m = mujoco.MjModel.from_xml_string(mjcf(robot, pinned))
     d = mujoco.MjData(m)
     feet = [m.geom(f"f{number}").id for number in range(len(robot.feet))]
@@ -279,7 +308,7 @@ def simulate(
     if robot.sole is not None:
         mujoco.mj_forward(m, d)
         plan = Balance(m, d, feet, seed)
-    keys = ("angles", "forces", "gyro", "accelerometer", "contact", "up")
+    keys = ("angles", "forces", "gyro", "accelerometer", "contact", "up", "feet")
     log: dict[str, Any] = {key: [] for key in keys}
     force = np.zeros(6)
     for k in range(round(seconds / STEP)):
@@ -303,6 +332,7 @@ def simulate(
         log["accelerometer"].append(R.T @ (d.qacc[:3] - m.opt.gravity))
         log["contact"].append((loads > 2.0).astype(float))
         log["up"].append(R[2, 2])
+        log["feet"].append(d.geom_xpos[feet].copy())
     log = {key: np.array(values) for key, values in log.items()}
     # The order of this package's joints.
     names = [*pinned.names][2:]
@@ -316,7 +346,7 @@ def recording(
     log: dict[str, np.ndarray], rng: Any = None, name: str = "log"
 ) -> jid.Recording:
     """Return a log as a recording, with noise."""
-    channels = {key: values for key, values in log.items() if key != "up"}
+    channels = {key: values for key, values in log.items() if key not in ("up", "feet")}
     if rng is not None:
         for key, size in NOISE.items():
             channels[key] = channels[key] + size * rng.normal(size=log[key].shape)

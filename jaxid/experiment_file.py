@@ -249,6 +249,10 @@ KEYS: dict[str, TomlTable] = {
         "tip_speed": Positive,
         "tip_acceleration": Positive,
         "workspace": tuple[Corner, Corner],
+        "pose": dict[str, float],
+        "ground_friction": Positive,
+        "support_margin": Annotated[float, Bounds(minimum=0.0, below=1.0)],
+        "sole_radius": Positive,
     },
     "collision": {
         "distance": Positive,

@@ -533,7 +533,7 @@ def test_the_guide_shows_every_key():
 def test_limits_that_nobody_gave_are_named(written, excited):
     (written / "open.toml").write_text(EXPERIMENT.replace("acceleration = [4]", ""))
     robot = load_experiment(written / "open.toml").setup.robot
-    limits = JointLimits(robot, excited.plan.limits.basis)
+    limits = JointLimits(robot, excited.plan.trajectory.basis)
     plan = dataclasses.replace(excited.plan, limits=limits)
     said = [remark.text for remark in plan_remarks(plan)]
     assert (

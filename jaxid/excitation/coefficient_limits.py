@@ -183,7 +183,7 @@ class JointLimits(eqx.Module):
         limits = robot.limits if limits is None else limits
         self.basis = basis
         self.limits = complete_limits(robot.replace(limits=limits))
-        self.assumed = _unknown_limits(limits)
+        self.assumed = unknown_limits(limits)
         rows, _ = basis.envelope(scale_samples(512, basis))
         peaks = np.array([np.abs(part).max(axis=0) for part in rows])
         sizes = self._sizes
@@ -273,7 +273,7 @@ def _lead(x: np.ndarray, axes: int) -> np.ndarray:
     return x[(None,) * (axes - x.ndim)]
 
 
-def _unknown_limits(limits: Limits):
+def unknown_limits(limits: Limits):
     """Return fields and joints (from 0) whose numbers were not given."""
     fields = []
     for name in ("position_min", "position_max", "velocity", "acceleration"):

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, PRNGKeyArray
+from jaxid.arrays import AnyArray, PRNGKeyArray, require_float64
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits
@@ -20,7 +20,13 @@ from .compiled_search import compiled_search, plan_parts
 from .constraints import AbstractConstraint
 from .criteria import AbstractCriterion
 from .criteria.information_matrix import BaseMatrix, JointVector
-from .design_result import DesignStatus, ExcitationPlan
+from .design_on_feet import DesignOnFeet, design_on_feet
+from .design_result import (
+    DesignProgress,
+    DesignStatus,
+    ExcitationPlan,
+    progress_status,
+)
 from .feasible_candidates import (
     Candidates,
     criterion_values,
@@ -28,6 +34,7 @@ from .feasible_candidates import (
     evaluate_within_limits,
     shrink_to_constraints,
 )
+from .motions_on_feet import Standing
 from .problem import ExcitationProblem
 from .random_feasible_motions import random_feasible_motions
 from .search import count_steps, search
@@ -38,31 +45,10 @@ Solver = Callable[[ExcitationProblem, ScaledMotions], AnyArray]
 
 SEARCH_SHARE = 0.65
 """Share of a limited time after which only the limits are kept more closely."""
-MIN_IMPROVEMENT = 2e-3
-"""Relative improvement in the last quarter of the steps of a converged design."""
 MIN_DURATION = 1e-3
 """Duration of a search whose time was over before it began [s]."""
 MAX_SHRUNK = 4
 """Motions that are made smaller where none keeps all constraints."""
-
-
-class DesignProgress(NamedTuple):
-    """Progress of a design.
-
-    Attributes:
-        fraction: Completed fraction, from 0 to 1.
-        task: Present task, in words.
-        best: Value of the criterion for the best motion so far that keeps all limits,
-            or of the best of all if none does.
-        feasible: Whether it keeps all limits.
-        trajectory: That motion.
-    """
-
-    fraction: float
-    task: str
-    best: float
-    feasible: bool
-    trajectory: LinearTrajectory
 
 
 def design_excitation(
@@ -78,12 +64,15 @@ def design_excitation(
     prior: BaseMatrix | None = None,
     samples: int = 800,
     seconds: float | None = None,
+    standing: Standing | None = None,
     **settings: Any,
 ) -> ExcitationPlan:
     r"""Find the motion that determines base parameters best within limits (Eq. 36).
 
     The problem is an `ExcitationProblem`, which `minimise` solves: that names further
-    settings. The limits of the joints hold for all times, not only at samples. The same
+    settings. A robot on its feet has other motions (`MotionOnFeet`): it moves its trunk
+    and lifts one foot after another. The limits of the joints hold for all times, not
+    only at samples. The same
     key gives the same motion.
 
     Args:
@@ -105,8 +94,10 @@ def design_excitation(
         samples: Number of measured samples of one run of the motion.
         seconds: Time after which the best motion so far is returned, counted from this
             call, with all that is compiled [s]; None for all steps.
+        standing: How a robot on its feet stands, and what keeps it from falling.
         settings: Arguments of `minimise`: `solver`, `starts`, `generations`, `key`,
-            `progress`, `begin`, `throw`.
+            `progress`, `begin`, `throw`. Those of a robot on its feet are `starts`,
+            `generations`, `key`, `progress` and `begin`.
 
     Raises:
         InputError: If arguments do not fit, or no motion keeps all constraints: the
@@ -115,6 +106,19 @@ def design_excitation(
         RuntimeError: If JAX runs in single precision.
     """
     start_time = time.monotonic()
+    if base.model.robot.floating:
+        require_float64("designing a motion")
+        if standing is None or basis is not None:
+            raise InputError(
+                f"`{base.model.robot.name}` stands on its feet: its motion needs "
+                "`standing` (`jid.excitation.Standing`), with nominal parameters, and "
+                "no `basis`."
+            )
+        limits_and_noise = (limits, criterion, constraints, noise, prior, samples)
+        design = DesignOnFeet(base, standing, harmonics, omega, *limits_and_noise)
+        if seconds is not None:
+            seconds -= time.monotonic() - start_time
+        return design_on_feet(design, seconds=seconds, **settings)
     basis = FourierBasis(harmonics, omega) if basis is None else basis
     problem = ExcitationProblem(
         base,
@@ -199,7 +203,9 @@ def minimise(
         base=problem.base,
         trajectory=problem.trajectory(motion),
         criterion=problem.criterion,
-        limits=problem.limits,
+        limits=problem.limits.limits,
+        assumed=problem.limits.assumed,
+        use=problem.limits.use(problem.limits.coefficients(motion)),
         information=problem.information(motion),
         reference=problem.information(median_motion),
         noise=problem.noise,
@@ -294,11 +300,4 @@ def _run_search(
         for place in candidates.order()[:MAX_SHRUNK]:
             smaller_motion = shrink_to_constraints(problem, candidates.x[place])
             candidates = candidates.improved(np.array([place]), smaller_motion)
-    return Outcome(candidates, history, _status(history))
-
-
-def _status(history: list[float]):
-    """Return whether the last quarter of the steps improved the motion."""
-    earlier_value = history[len(history) - 1 - len(history) // 4]
-    is_improving = history[-1] < (1.0 - MIN_IMPROVEMENT) * earlier_value
-    return DesignStatus.IMPROVING if is_improving else DesignStatus.CONVERGED
+    return Outcome(candidates, history, progress_status(history))

@@ -3,6 +3,7 @@
 import enum
 import functools
 import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -21,10 +22,13 @@ from jaxid.result_table import (
     Table,
     significant,
 )
+from jaxid.robot.limits_and_drives import Limits
+from jaxid.robot.robot import Robot
+from jaxid.robot.virtual_joints import driven_robot
 from jaxid.trajectory.files import save_trajectory
+from jaxid.trajectory.motion_on_feet import MotionOnFeet
 from jaxid.trajectory.trajectory import LinearTrajectory
 
-from .coefficient_limits import JointLimits
 from .constraints import Finding
 from .criteria import CRITERIA, AbstractCriterion, Information, standard_deviations
 from .criteria.information_matrix import BaseVector, JointVector
@@ -40,6 +44,36 @@ class DesignStatus(enum.StrEnum):
     IMPROVING = "the last quarter of its steps still improved the motion"
     STOPPED = "stopped before its end"
     GIVEN = "found by a solver of your own"
+
+
+MIN_IMPROVEMENT = 2e-3
+"""Relative improvement in the last quarter of the steps of a converged design."""
+
+
+def progress_status(history: Sequence[float]) -> DesignStatus:
+    """Return whether the last quarter of the steps improved the motion."""
+    earlier_value = history[len(history) - 1 - len(history) // 4]
+    is_improving = history[-1] < (1.0 - MIN_IMPROVEMENT) * earlier_value
+    return DesignStatus.IMPROVING if is_improving else DesignStatus.CONVERGED
+
+
+class DesignProgress(NamedTuple):
+    """Progress of a design.
+
+    Attributes:
+        fraction: Completed fraction, from 0 to 1.
+        task: Present task, in words.
+        best: Value of the criterion for the best motion so far that keeps all limits,
+            or of the best of all if none does.
+        feasible: Whether it keeps all limits.
+        trajectory: That motion.
+    """
+
+    fraction: float
+    task: str
+    best: float
+    feasible: bool
+    trajectory: LinearTrajectory | MotionOnFeet
 
 
 class Comparison(NamedTuple):
@@ -58,6 +92,8 @@ class ExcitationPlan(Summarised, eqx.Module):
         trajectory: The motion.
         criterion: Criterion that was minimised.
         limits: Limits of the joints, with those that were assumed.
+        assumed: Fields of the limits and joints (from 0) whose numbers were not given.
+        use: Used fraction of the limits of position, speed, acceleration and jerk.
         information: Information of one run of the motion.
         reference: Information of a random motion that keeps the same limits, as far as
             any was found: the median of the motions from which the search started.
@@ -70,9 +106,11 @@ class ExcitationPlan(Summarised, eqx.Module):
     """
 
     base: BaseParameters
-    trajectory: LinearTrajectory
+    trajectory: LinearTrajectory | MotionOnFeet
     criterion: AbstractCriterion
-    limits: JointLimits
+    limits: Limits
+    assumed: tuple[tuple[str, int], ...] = eqx.field(static=True)
+    use: Float[AnyArray, "4 joints"]
     information: Information
     reference: Information
     noise: JointVector
@@ -134,9 +172,9 @@ class ExcitationPlan(Summarised, eqx.Module):
         return float(np.exp(np.mean(np.log(gains[is_determined]))))
 
     @property
-    def use(self) -> np.ndarray:
-        """Used fraction of the limits of position, speed, acceleration and jerk."""
-        return self.limits.use(self.trajectory.coefficients)
+    def robot(self) -> Robot:
+        """Robot of the joints that move: of one on its feet, those that are driven."""
+        return driven_robot(self.base.model.robot)
 
     @property
     def undetermined(self) -> tuple[str, ...]:
@@ -185,7 +223,7 @@ class ExcitationPlan(Summarised, eqx.Module):
 
     def _limits_table(self):
         """Return the table of the use of the limits that are finite."""
-        columns = [Column("joint", self.base.model.robot.joint_names)]
+        columns = [Column("joint", self.robot.joint_names)]
         kinds = ("position", "speed", "acceleration", "jerk")
         for kind, use in zip(kinds, self.use, strict=True):
             if (use > 0).any():

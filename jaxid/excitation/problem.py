@@ -97,8 +97,7 @@ class ExcitationProblem:
         if robot.floating:
             raise InputError(
                 f"`{robot.name}` has a floating base, whose motion follows from its "
-                "contacts: no motion is designed; move the trunk on all feet, then "
-                "lift one foot after another."
+                "contacts: use `jid.design_excitation` with `standing`."
             )
         self.base = base
         self.basis = FourierBasis(5, 0.8) if basis is None else basis

@@ -12,6 +12,7 @@ import numpy as np
 import scipy
 
 from jaxid.arrays import AnyArray, Float, Matrix
+from jaxid.dynamics.contact_elimination import elimination
 from jaxid.dynamics.motion import Motion, floating_motion
 from jaxid.errors import InputError
 from jaxid.robot.contacts import legs_of
@@ -167,46 +168,6 @@ def _all_forces(robot: Robot, motion: Motion, forces: Matrix) -> Matrix:
         leg_forces = every_force[:, list(legs.joints)]
         every_force[:, list(legs.rows)] -= np.einsum("nij,nj->ni", X, leg_forces)
     return every_force
-
-
-def elimination(
-    robot: Robot, q: AnyArray, up: AnyArray, stands: AnyArray
-) -> np.ndarray:
-    """Return $X$ of all legs at many samples, zero where a foot does not stand.
-
-    Args:
-        robot: Robot with contacts.
-        q: Coordinates [samples joints].
-        up: Unit vector against gravity in the frame of the base [samples 3].
-        stands: Whether each contact stands [samples contacts].
-
-    Returns:
-        Entries of $X$, row by row [samples entries].
-    """
-    legs = legs_of(robot)
-    matrices = []
-    for number, contact in enumerate(robot.contacts):
-        foot = robot.replace(tip_body=contact.body, tip_offset=contact.position)
-        tip = tip_jacobian(foot, np.asarray(q))
-        # Joints in the order of their numbers.
-        order = np.argsort(robot.order)
-        velocity = tip.velocity[:, order]
-        turn = tip.turn[:, order]
-        jacobian = contact.shape.jacobian(velocity, turn, up)
-        force_of_leg = np.linalg.pinv(jacobian[:, list(legs.own_joints[number])])
-        X = jacobian[:, list(legs.rows)] @ force_of_leg
-        matrices.append(np.where(stands[:, number, None, None], X, 0.0))
-    return np.concatenate(matrices, axis=2).reshape(len(q), -1)
-
-
-def contact_mask(robot: Robot, motion: Motion) -> np.ndarray:
-    """Return the rows that count: not those of the joints of legs that stand."""
-    mask = np.ones(motion.q.shape, bool)
-    if motion.contacts is not None:
-        legs = legs_of(robot)
-        X = motion.contacts.reshape(len(mask), len(legs.rows), len(legs.joints))
-        mask[:, list(legs.joints)] = (X == 0.0).all(axis=1)
-    return mask
 
 
 def all_standing(recording: Recording, robot: Robot) -> Recording:

@@ -18,6 +18,7 @@ from jaxid.arrays import (
     Texts,
     Vector,
 )
+from jaxid.dynamics.contact_elimination import contact_mask
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import per_joint
@@ -25,7 +26,7 @@ from jaxid.robot.robot import Robot
 
 from .filters import AbstractFilter, Subsample, ZeroPhaseButterworth
 from .filters.filter import EVERY_SAMPLE
-from .floating_base import contact_grid, contact_mask, floating_samples
+from .floating_base import contact_grid, floating_samples
 from .force_sensors import (
     measured_joints,
     on_all_joints,

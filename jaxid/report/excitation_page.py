@@ -11,6 +11,8 @@ from jaxid.io import write_text
 from jaxid.result_table import Remark, Status, significant, sort_remarks
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.limits_and_drives import listed
+from jaxid.robot.virtual_joints import with_moving_base
+from jaxid.trajectory.motion_on_feet import MotionOnFeet
 from jaxid.trajectory.trajectory import AbstractTrajectory
 
 from .motion_figures import joint_figure, speed_figure
@@ -20,7 +22,7 @@ from .page import Settings, picture, provenance, render_page
 def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     """Return the assumptions and doubts that a reader of a design must know."""
     robot = plan.base.model.robot
-    times = plan.limits.basis.times(plan.samples)
+    times = plan.trajectory.measured_times(plan.samples)
     step = float(times[1] - times[0])
     noise = ", ".join(
         f"{significant(float(deviation))} {robot.force_unit(j)}"
@@ -34,13 +36,13 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
     )
 
     doubts = []
-    unpublished_limits = ", ".join(plan.limits.limits.assumed)
+    unpublished_limits = ", ".join(plan.limits.assumed)
     if unpublished_limits:
         doubts.append(
             "The manufacturer has not published these limits, so they are assumed: "
             f"{unpublished_limits}"
         )
-    if plan.limits.assumed:
+    if plan.assumed:
         doubts.append(
             "The robot's description lacks these limits, so they are assumed: "
             f"{_assumed_limits(plan)}"
@@ -53,11 +55,11 @@ def plan_remarks(plan: ExcitationPlan) -> list[Remark]:
 
 def _assumed_limits(plan: ExcitationPlan) -> str:
     """Return the limits that were assumed, with their values and joints."""
-    robot = plan.base.model.robot
+    robot = plan.robot
     rate_units = {"velocity": "/s", "acceleration": "/s²"}
     joints_by_limit: dict[str, list[str]] = {}
-    for name, j in plan.limits.assumed:
-        values = getattr(plan.limits.limits, name)
+    for name, j in plan.assumed:
+        values = getattr(plan.limits, name)
         value = float(values[j])
         unit = f"{robot.joint_unit(j)}{rate_units.get(name, '')}"
         # Joints with the same value are named together.
@@ -83,7 +85,7 @@ def write_excitation(
     The motion as it is played is drawn among the `shapes`. `settings` tell the origin
     of the design as in `provenance`.
     """
-    robot = plan.base.model.robot
+    robot = plan.robot
     caption = (
         "The colour of a link shows the speed of its joint. The pale shapes were "
         "checked for collisions; grey ones do not move. Drag the picture to turn it."
@@ -91,8 +93,14 @@ def write_excitation(
     with double_precision():
         time = np.linspace(0.0, float(played.duration), 801)
         motion = played.motion(time)
-    limits = plan.limits.limits
-    scene = speed_figure(robot, limits, time, motion, shapes)
+    limits = plan.limits
+    scene_robot = robot
+    scene_motion = motion
+    if isinstance(played, MotionOnFeet):
+        # The trunk moves, too.
+        scene_robot = with_moving_base(plan.base.model.robot)
+        scene_motion = played.motion_on_ground(time)
+    scene = speed_figure(scene_robot, scene_robot.limits, time, scene_motion, shapes)
     all_remarks = sort_remarks((*plan_remarks(plan), *remarks))
     criteria, deviations, *use = plan.tables()
     gain = (

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from jaxid.arrays import Joints, Matrix3, Numbers, as_array
+from jaxid.arrays import AnyArray, Joints, Matrix3, Numbers, as_array
 from jaxid.errors import InputError
 
 from .forward_kinematics import TipJacobian, tip_curvature, tip_jacobian
@@ -152,7 +152,7 @@ def _newton_step(
     # Coordinates count relative to half of their ranges.
     scale = task.half_range
     tip = tip_jacobian(task.robot, q)
-    errors = _pose_errors(task, positions, tip)
+    errors = pose_errors(tip, positions, task.rotation)
     jacobian = tip.slopes * scale[:, None]
     hessian = np.eye(joints)
     if curved:
@@ -184,9 +184,11 @@ def _saddle_point_matrix(hessian: np.ndarray, jacobian: np.ndarray):
     return np.concatenate([upper_rows, lower_rows], axis=1)
 
 
-def _pose_errors(task: _TipTask, positions: np.ndarray, tip: TipJacobian):
+def pose_errors(
+    tip: TipJacobian, positions: np.ndarray, rotations: AnyArray
+) -> np.ndarray:
     """Return the differences of positions [m] and of attitudes [rad] from poses."""
-    turn = tip.rotation @ task.rotation.T
+    turn = tip.rotation @ np.swapaxes(np.asarray(rotations), -1, -2)
     vector = scipy.spatial.transform.Rotation.from_matrix(turn).as_rotvec()
     return np.concatenate([tip.position - positions, vector], axis=1)
 
@@ -194,7 +196,7 @@ def _pose_errors(task: _TipTask, positions: np.ndarray, tip: TipJacobian):
 def _require_followed(task: _TipTask, positions: np.ndarray, q: np.ndarray):
     """Reject coordinates that miss a pose, leave their range or jump."""
     robot = task.robot
-    errors = _pose_errors(task, positions, tip_jacobian(robot, q))
+    errors = pose_errors(tip_jacobian(robot, q), positions, task.rotation)
     distances = np.linalg.norm(errors[:, :3], axis=1)
     angles = np.linalg.norm(errors[:, 3:], axis=1)
     excess = np.maximum(task.low - q, q - task.high) / task.half_range

@@ -229,6 +229,15 @@ def driven_robot(robot: Any) -> Any:
     )
 
 
+def with_moving_base(robot: Any) -> Any:
+    """Return a robot whose floating base moves on joints like any others.
+
+    Coordinates of the base are its position on the ground, then its turns about x, y
+    and z in a row.
+    """
+    return robot.replace(virtual=(), floating=False, contacts=())
+
+
 def with_driven(robot: Any, joints: Any) -> Any:
     """Return the robot with the limits and drives of its driven joints replaced."""
     if not robot.virtual:

@@ -93,7 +93,8 @@ def write_csv(
     """Write a table of times, positions, velocities and accelerations.
 
     The header names joint and unit: `time [s],q_joint1 [rad],...,qdd_joint1
-    [rad/s^2],...`.
+    [rad/s^2],...`. Of a robot on its feet, `contact_FOOT` is 1 where the foot is to
+    stand.
 
     Args:
         trajectory: Trajectory, sampled from its start to its end.
@@ -111,6 +112,7 @@ def write_csv(
         for j, name in enumerate(robot.joint_names):
             header = f"{symbol}_{name} [{robot.joint_unit(j)}{rate}]"
             columns[header] = np.asarray(getattr(motion, symbol))[:, j]
+    columns |= trajectory.columns(times)
     write_text(path, pl.DataFrame(columns).write_csv())
 
 

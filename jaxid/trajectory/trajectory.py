@@ -62,6 +62,14 @@ class AbstractTrajectory(Hashable):
         """Return the motion at one time or at many [s]."""
         return _motion(self, jnp.asarray(t, float))
 
+    def measured_times(self, samples: int) -> Times:
+        """Return equidistant times at which a run is measured [s]."""
+        return np.arange(samples) * (float(self.duration) / samples)
+
+    def columns(self, t: AnyArray) -> dict[str, AnyArray]:
+        """Return what a table says beside the motion, by name, at times [s]."""
+        return {}
+
     @property
     def joints(self) -> int:
         """Number of joints."""
@@ -115,6 +123,10 @@ class PaddedToCycle(AbstractTrajectory):
     def states(self, t):
         """Return the motion, and its final pose after its end."""
         return self.inner.states(jnp.minimum(t, self.inner.duration))
+
+    def columns(self, t):
+        """Return the columns of the motion."""
+        return self.inner.columns(t)
 
 
 def count_cycles(duration: float, sample_time: float) -> int:
@@ -226,6 +238,10 @@ class LinearTrajectory(AbstractTrajectory):
     def duration(self) -> Time:
         """Duration of the basis [s]."""
         return self.basis.duration
+
+    def measured_times(self, samples):
+        """Return the times at which motions of the basis are measured [s]."""
+        return self.basis.times(samples)
 
     def states(self, t):
         """Return the rows of the basis times the coefficients."""

@@ -15,6 +15,10 @@ from jaxid.trajectory.spline import RestToRestSplineBasis
 from jaxid.trajectory.trajectory import AbstractBasis, count_cycles
 
 Corner = tuple[float, float, float]
+HARMONICS = 5
+"""Number of harmonics of the series of an arm."""
+HARMONICS_ON_FEET = 20
+"""The same of a robot on its feet: each phase is one period."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -37,7 +41,8 @@ class Excitation:
     Attributes:
         criterion: Objective: "d_optimal" for the smallest standard deviations overall,
             "condition_number" for the paper's (Eq. 36), or another criterion.
-        harmonics: Number of harmonics of the Fourier series.
+        harmonics: Number of harmonics of the Fourier series, like `8`; by default 5,
+            and 20 of a robot on its feet.
         omega: Fundamental frequency of the series [rad/s].
         rest: Whether the motion starts and stops at rest.
         spline: Spline from rest to rest in place of a series, like
@@ -67,10 +72,18 @@ class Excitation:
         tip_acceleration: Largest acceleration of the end-effector [m/s²], like `10.0`.
         workspace: Box for the end-effector: two corners [m], like
             `[[-1.0, -1.0, 0.1], [1.0, 1.0, 1.5]]`.
+        pose: Angles [rad] in which a robot stands on its feet, of the joints whose
+            names contain a word, like `{ thigh = 0.8, calf = -1.6 }`; by default a pose
+            with bent knees is found.
+        ground_friction: Coefficient of friction between its feet and the ground.
+        support_margin: Least distance of its zero-moment point from the border of the
+            feet that stand, relative to that of their middle.
+        sole_radius: Radius of a circle about the point of a sole that surely touches
+            the ground [m].
     """
 
     criterion: str = "d_optimal"
-    harmonics: int = 5
+    harmonics: int | None = None
     omega: float = 0.8
     rest: bool = False
     spline: RestToRestSplineBasis | None = None
@@ -89,6 +102,10 @@ class Excitation:
     tip_speed: float = math.inf
     tip_acceleration: float = math.inf
     workspace: tuple[Corner, Corner] | None = None
+    pose: dict[str, float] | None = None
+    ground_friction: float = 0.5
+    support_margin: float = 0.35
+    sole_radius: float = 0.03
 
     @property
     def objective(self) -> AbstractCriterion:
@@ -128,7 +145,7 @@ class Excitation:
                     "at rest anyway: leave one of them out."
                 )
             return self.spline
-        series = (self.harmonics, self.omega)
+        series = (self.harmonics or HARMONICS, self.omega)
         if self.rest:
             return RestToRestBasis(*series)
         leads = self.chosen_leads

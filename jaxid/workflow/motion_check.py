@@ -7,7 +7,9 @@ import numpy as np
 from jaxid.excitation.constraints import Finding, LoopLimits
 from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.result_table import Remark, Status
+from jaxid.robot.robot import Robot
 from jaxid.robot.shapes import HalfSpace
+from jaxid.trajectory.motion_on_feet import MotionOnFeet
 
 from .surroundings import Surroundings
 
@@ -35,13 +37,18 @@ def check_motion(
             is_of_floor = any(finding.name.endswith(f" and {x}") for x in floors)
             group = floor_findings if is_of_floor else other_findings
             group.append(finding)
-    yield check_floor(surroundings, bool(floors), floor_findings)
-    yield from check_self_collision(surroundings, other_findings)
     force_findings = [
         finding
         for finding in plan.findings
         if finding.name.startswith(("the force of", "the torque of"))
     ]
+    if plan.base.model.robot.floating:
+        known_findings = [*other_findings, *force_findings]
+        findings = [x for x in plan.findings if x not in known_findings]
+        yield judge("standing on the feet", findings)
+    else:
+        yield check_floor(surroundings, bool(floors), floor_findings)
+    yield from check_self_collision(surroundings, other_findings)
     if force_fault:
         yield Remark(f"forces: {force_fault}", Status.BAD)
     elif force_findings:
@@ -52,7 +59,7 @@ def check_motion(
 
 def check_joints(plan: ExcitationPlan) -> Remark:
     """Return whether the joints keep their limits."""
-    derivatives = 4 if np.isfinite(np.asarray(plan.limits.limits.jerk)).any() else 3
+    derivatives = 4 if np.isfinite(np.asarray(plan.limits.jerk)).any() else 3
     excess = np.asarray(plan.use)[:derivatives].max() - 1.0
     quantities = "positions, speeds, accelerations"
     if excess > MAX_ROUNDING:
@@ -60,6 +67,34 @@ def check_joints(plan: ExcitationPlan) -> Remark:
         return Remark(text, Status.BAD)
     return Remark(
         f"{quantities}: all joints keep their limits at all times", Status.GOOD
+    )
+
+
+def describe_standing(robot: Robot, motion: MotionOnFeet) -> Iterator[Remark]:
+    """Yield the standing pose, the phases, and what is not known of standing.
+
+    Args:
+        robot: Robot of the driven joints.
+        motion: Its motion.
+    """
+    pose = np.asarray(motion.motion(np.zeros(1)).q)[0]
+    angles = ", ".join(
+        f"{name} {angle:.3f}"
+        for name, angle in zip(robot.joint_names, pose, strict=True)
+    )
+    yield Remark(f"standing pose, at the begin and at the end [rad]: {angles}")
+    lifts = ", ".join(
+        f"{foot} from {start:.2f} to {stop:.2f} s"
+        for foot, (start, stop) in zip(motion.feet, motion.lifts, strict=True)
+    )
+    yield Remark(
+        f"feet in the air: {lifts}; columns `contact_…` of the table are 0 then"
+    )
+    yield Remark(
+        "standing on the feet: not checked are ground that is not level, and "
+        "controllers that are not stiff, so that legs give way under the weight: "
+        "secure the robot against a fall",
+        Status.DOUBTFUL,
     )
 
 

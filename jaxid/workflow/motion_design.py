@@ -3,7 +3,7 @@
 import dataclasses
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple, cast
 
 import jax
 import numpy as np
@@ -13,6 +13,7 @@ from jaxid.errors import InputError
 from jaxid.excitation.constraints import AbstractConstraint, TipLimits
 from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.design_result import ExcitationPlan
+from jaxid.excitation.motions_on_feet import Standing
 from jaxid.io import atomic_folder, import_extra
 from jaxid.report.excitation_page import (
     motion_verdict,
@@ -22,6 +23,7 @@ from jaxid.report.excitation_page import (
 from jaxid.result_table import Remark, Status, Summarised, Table, sort_remarks
 from jaxid.robot.limits_and_drives import complete_limits
 from jaxid.robot.robot import Robot
+from jaxid.robot.virtual_joints import driven_robot
 from jaxid.trajectory.controllers import CONTROLLER_SUFFIXES, CONTROLLERS
 from jaxid.trajectory.files import (
     load_trajectory,
@@ -31,6 +33,7 @@ from jaxid.trajectory.files import (
 )
 from jaxid.trajectory.fourier import FourierBasis
 from jaxid.trajectory.lead_in_and_out import WithLeads, with_leads
+from jaxid.trajectory.motion_on_feet import MotionOnFeet
 from jaxid.trajectory.trajectory import (
     AbstractBasis,
     AbstractTrajectory,
@@ -38,19 +41,25 @@ from jaxid.trajectory.trajectory import (
     PaddedToCycle,
 )
 
-from .excitation_settings import Excitation
-from .motion_check import check_motion
+from .excitation_settings import HARMONICS_ON_FEET, Excitation
+from .motion_check import check_motion, describe_standing
 from .nominal_parameters import (
     UNKNOWN_SHARE,
+    LimitedForces,
     Nominal,
     find_nominal,
     limit_forces,
+    require_weight,
 )
 from .setup import Progress, Setup, ignore_progress
 from .surroundings import Surroundings
 
-Improvement = Callable[[LinearTrajectory], None]
+Improvement = Callable[[LinearTrajectory | MotionOnFeet], None]
 """Callback, called with every better motion that keeps all limits."""
+
+
+STEP_ON_FEET = 0.005
+"""Time between two rows of the table of a robot on its feet, if none is given [s]."""
 
 
 class MotionTask(NamedTuple):
@@ -72,7 +81,32 @@ class MotionTask(NamedTuple):
     nominal: Nominal | None
     constraints: tuple[AbstractConstraint, ...]
     force_fault: str
-    begin: LinearTrajectory | None = None
+    begin: LinearTrajectory | MotionOnFeet | None = None
+
+    @property
+    def family(self) -> dict[str, Any]:
+        """Arguments of `design_excitation` that say what kind of motion it is."""
+        if not self.setup.robot.floating:
+            return {"basis": self.basis}
+        excitation = self.excitation
+        parameters = cast(Nominal, self.nominal).parameters
+        is_known = not np.isnan(parameters).any()
+        margin = excitation.force_margin
+        if margin is None:
+            margin = 0.0 if is_known else UNKNOWN_SHARE
+        standing = Standing(
+            np.nan_to_num(parameters),
+            excitation.pose,
+            excitation.ground_friction,
+            excitation.support_margin,
+            excitation.sole_radius,
+            margin,
+        )
+        return {
+            "standing": standing,
+            "harmonics": excitation.harmonics or HARMONICS_ON_FEET,
+            "omega": excitation.omega,
+        }
 
     @property
     def basis(self) -> AbstractBasis:
@@ -153,7 +187,11 @@ def prepare_motion(
     """
     require_playable(setup, excitation)
     nominal = find_nominal(setup, excitation)
-    forces = limit_forces(setup, excitation, nominal)
+    forces = LimitedForces(None, "")
+    if setup.robot.floating:
+        require_weight(setup, nominal)
+    else:
+        forces = limit_forces(setup, excitation, nominal)
     tip = TipLimits(
         excitation.tip_speed, excitation.tip_acceleration, *(excitation.workspace or ())
     )
@@ -171,8 +209,11 @@ def prepare_motion(
         return task
     begin = load_trajectory(earlier_design)
     begin = begin.inner if isinstance(begin, WithLeads) else begin
-    basis = task.basis
-    if not (isinstance(begin, LinearTrajectory) and str(begin.basis) == str(basis)):
+    is_alike = isinstance(begin, MotionOnFeet)
+    if not setup.robot.floating:
+        basis = getattr(begin, "basis", None)
+        is_alike = str(basis) == str(task.basis)
+    if not is_alike:
         raise InputError(
             f"`{earlier_design}` holds a motion of another kind: design anew."
         )
@@ -214,7 +255,7 @@ def design_motion(
     noise = None if excitation.noise is None else np.array(excitation.noise)
     plan = design_excitation(
         setup.base,
-        basis=task.basis,
+        **task.family,
         constraints=task.constraints,
         key=jax.random.key(excitation.seed),
         noise=noise,
@@ -251,18 +292,22 @@ def follow_design(
 
 
 def make_playable(
-    robot: Robot, excitation: Excitation, motion: LinearTrajectory
+    robot: Robot, excitation: Excitation, motion: LinearTrajectory | MotionOnFeet
 ) -> PlayableMotion:
     """Return a motion from standstill to standstill, in samples of the controller."""
     leads = excitation.chosen_leads
-    times = np.asarray(motion.basis.times(excitation.samples))
+    times = np.asarray(motion.measured_times(excitation.samples))
     step = float(times[1] - times[0])
     begin = float(times[0])
     end = float(times[-1]) + step
     played_motion = motion
     fault = ""
+    if isinstance(motion, MotionOnFeet):
+        # It stands still at both ends.
+        leads = None
+        step = STEP_ON_FEET
     # Where there are constraints, leads were designed together with the motion.
-    if leads is not None and isinstance(motion.basis, FourierBasis):
+    elif leads is not None and isinstance(motion.basis, FourierBasis):
         limited_robot = robot.replace(limits=complete_limits(robot))
         try:
             played_motion = with_leads(motion, limited_robot, periods=leads.periods)
@@ -311,14 +356,16 @@ def write_design(
         task.surroundings.shapes,
     )
     motion_files = write_motion(
-        task.setup.robot, task.excitation, design.playable, output
+        design.plan.robot, task.excitation, design.playable, output
     )
     return motion_files + pages
 
 
-def write_best_motion(task: MotionTask, motion: LinearTrajectory, output: Path) -> None:
+def write_best_motion(
+    task: MotionTask, motion: LinearTrajectory | MotionOnFeet, output: Path
+) -> None:
     """Write a motion of a search, as it can be played."""
-    robot = task.setup.robot
+    robot = driven_robot(task.setup.robot)
     playable = make_playable(robot, task.excitation, motion)
     write_motion(robot, task.excitation, playable, output)
 
@@ -369,7 +416,9 @@ def describe_motion(
             "give `noise` if it is known"
         )
     leads = excitation.chosen_leads
-    if leads is not None and leads.periods > 1:
+    if isinstance(plan.trajectory, MotionOnFeet):
+        yield from describe_standing(plan.robot, plan.trajectory)
+    elif leads is not None and leads.periods > 1:
         yield Remark(
             f"the motion runs through {leads.periods} periods; the deviations are for "
             "one period"

@@ -70,6 +70,16 @@ def _of_earlier_fit(base: BaseParameters, report: str) -> Nominal:
     return Nominal(np.asarray(fit.parameters), covariance, names)
 
 
+def require_weight(setup: Setup, nominal: Nominal | None) -> None:
+    """Reject a robot on its feet of whose weight nothing is known: it might fall."""
+    if nominal is None:
+        raise InputError(
+            f"`{setup.robot.name}` stands on its feet, and nothing is known of its "
+            "masses, so that nobody can say whether a motion makes it fall: give a "
+            "robot's file with inertias, or a report as `excitation.nominal`."
+        )
+
+
 class LimitedForces(NamedTuple):
     """Limits of the forces in a design; or why there are none."""
 

@@ -18,6 +18,7 @@ from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpac
 from jaxid.robot.limits_and_drives import owners
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
+from jaxid.robot.virtual_joints import with_moving_base
 
 from .robot_file import RobotFile, joint_number
 
@@ -98,6 +99,7 @@ class Collision:
         Raises:
             InputError: If shapes cannot be made, or a name is unknown.
         """
+        robot_stands = robot.floating
         user_capsules = []
         for body, shape in self.capsules:
             number = GROUND if body == "ground" else joint_number(robot, body)
@@ -110,11 +112,16 @@ class Collision:
             capsules, faults = fit_links(robot_file, self.packages, known_bodies)
         capsules += user_capsules
         obstacles: list[Box | HalfSpace] = list(self.boxes)
-        if self.floor in ("base", True):
+        if robot_stands:
+            # Its feet touch the floor. Boxes stand beside its standing pose.
+            robot = with_moving_base(robot)
+            if not capsules:
+                faults.append("no shape of the robot is known")
+        elif self.floor in ("base", True):
             obstacles.append(base_plane or HalfSpace("floor"))
         elif self.floor is not False:
             obstacles.append(HalfSpace("floor", height=self.floor))
-        if self.fit:
+        if self.fit and not robot_stands:
             substitutes = substitute_capsules(robot, capsules)
             capsules += substitutes
             if substitutes:

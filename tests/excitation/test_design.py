@@ -68,7 +68,7 @@ def test_keeps_limits_uses_them_and_beats_random_motions(designed, excess):
 
 
 def test_expected_deviations_are_those_of_repeated_experiments(plan):
-    base, times = plan.base, plan.limits.basis.times(plan.samples)
+    base, times = plan.base, plan.trajectory.measured_times(plan.samples)
     theta = np.asarray(base.regressor(plan.trajectory.motion(times)))
     weighted = (theta / plan.noise[:, None]).reshape(-1, base.size)
     noise = np.random.default_rng(0).standard_normal((len(weighted), 2000))

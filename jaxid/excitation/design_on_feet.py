@@ -1,0 +1,300 @@
+"""Design of the motion of a robot on its feet (Eq. 36).
+
+Phases are independent of each other, and their information adds up. So one phase after
+another is replaced: by a random motion at first, then by changes of the best one. A
+candidate is made smaller until it keeps all limits, and taken if the criterion falls.
+"""
+
+import dataclasses
+import math
+import time
+from collections.abc import Callable, Sequence
+from typing import NamedTuple
+
+import jax
+import numpy as np
+
+from jaxid.arrays import PRNGKeyArray
+from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.contact_elimination import contact_mask, elimination
+from jaxid.errors import InputError
+from jaxid.robot.limits_and_drives import Limits, complete_limits
+from jaxid.robot.virtual_joints import GROUP, driven_robot
+from jaxid.trajectory.motion_on_feet import MotionOnFeet
+
+from .checks_on_feet import CheckedMotion, ChecksOnFeet
+from .coefficient_limits import unknown_limits
+from .constraints import AbstractConstraint
+from .criteria import AbstractCriterion, DOptimal, Information
+from .criteria.information_matrix import BaseMatrix, JointVector
+from .design_result import DesignProgress, DesignStatus, ExcitationPlan, progress_status
+from .ground_forces import measured_motion
+from .motions_on_feet import MotionsOnFeet, Phase, Standing
+from .problem import CHECKED_INSTANTS, assumed_noise
+
+NOISE_SHARE = 0.01
+"""Noise of the force on the base, relative to the weight."""
+GUARD = 0.5
+"""Time around a change of contact whose samples are not counted on [s]."""
+SHRINKAGE = 0.8
+"""Factor by which a motion is made smaller until it keeps all limits."""
+MAX_SHRINKAGES = 12
+"""Times that it is; then it becomes a motion without waves."""
+CHANGED_SHARE = 0.3
+"""Share of the coordinates that a change of a motion replaces."""
+CHANGES = 4
+"""Changes of each phase in a generation."""
+
+
+class Candidate(NamedTuple):
+    """A phase that keeps all limits, and what it tells."""
+
+    phase: Phase
+    information: Information
+
+
+class DesignOnFeet:
+    """Search for a motion on feet.
+
+    Args:
+        base: Base parameters to be determined.
+        standing: How the robot stands.
+        harmonics: Number of harmonics of each phase.
+        omega: Ground frequency [rad/s].
+        limits: Limits of the driven joints; the robot's if None.
+        criterion: Criterion to be minimised.
+        constraints: Constraints beside these limits.
+        noise: Standard deviation of the forces' noise of each driven joint.
+        prior: Information of earlier experiments.
+        samples: Number of measured samples of one run.
+    """
+
+    def __init__(
+        self,
+        base: BaseParameters,
+        standing: Standing,
+        harmonics: int,
+        omega: float,
+        limits: Limits | None,
+        criterion: AbstractCriterion | None,
+        constraints: tuple[AbstractConstraint, ...],
+        noise: JointVector | None,
+        prior: BaseMatrix | None,
+        samples: int,
+    ):
+        self.base = base
+        self.motions = MotionsOnFeet(base, standing, harmonics, omega)
+        joints = driven_robot(base.model.robot)
+        self.known_limits = joints.limits if limits is None else limits
+        self.limits = complete_limits(joints.replace(limits=self.known_limits))
+        self.checks = ChecksOnFeet(self.motions, self.limits, constraints)
+        self.criterion = DOptimal() if criterion is None else criterion
+        joint_noise = assumed_noise(joints) if noise is None else np.asarray(noise)
+        if joint_noise.shape != (joints.joints,):
+            raise InputError(
+                "`noise` must hold one number for each of the "
+                f"{joints.joints} driven joints, but is {joint_noise}."
+            )
+        # Also 1 % of the weight, and of its moment about the ground.
+        rest = self.motions.phase(0, np.zeros(self.motions.shape))
+        trunk = measured_motion(base.model.robot, rest.motion(np.zeros(1)))
+        weight = base.forces_in_numpy(standing.parameters, trunk.motion)[0, 2]
+        force_noise = np.full(3, NOISE_SHARE * weight)
+        moment_noise = force_noise * self.motions.pose[2]
+        self.noise = np.concatenate([force_noise, moment_noise, joint_noise])
+        self.samples = samples
+        self.prior = 0.0 if prior is None else np.asarray(prior)
+        self.sizes = np.ones(base.size)
+        self._value = jax.jit(self.criterion)
+
+    def information(self, phase: Phase) -> Information:
+        """Return what the samples of a phase tell."""
+        motions = self.motions
+        times = motions.times
+        stands = phase.stands(times, len(motions.legs))
+        trunk = measured_motion(motions.robot, phase.motion(times))
+        X = elimination(motions.robot, trunk.motion.q, trunk.up, stands)
+        motion = dataclasses.replace(trunk.motion, contacts=X)
+        mask = contact_mask(motions.robot, motion)
+        if phase.foot is not None:
+            distances = np.abs(times[:, None] - np.array(phase.lift))
+            is_near = (distances <= GUARD).any(axis=1)
+            mask[is_near] = False
+        rows = np.asarray(self.base.regressor(motion))
+        # The samples of one run are shared by all phases.
+        share = self.samples / motions.phases / len(times)
+        plain_rows = rows[mask]
+        weighted_rows = (rows / self.noise[:, None])[mask]
+        return Information(
+            share * plain_rows.T @ plain_rows,
+            share * weighted_rows.T @ weighted_rows,
+            self.sizes,
+        )
+
+    def total(self, candidates: Sequence[Candidate]) -> Information:
+        """Return the information of all phases and of earlier experiments."""
+        plain = np.sum([x.information.plain for x in candidates], axis=0)
+        weighted = np.sum([x.information.weighted for x in candidates], axis=0)
+        return Information(plain, weighted + self.prior, self.sizes)
+
+    def value(self, candidates: Sequence[Candidate]) -> float:
+        """Return the criterion of all phases."""
+        return float(np.exp(self._value(self.total(candidates))))
+
+    @property
+    def instants(self) -> np.ndarray:
+        """Times of a phase at which the result is checked, from its start [s]."""
+        count = CHECKED_INSTANTS // self.motions.phases
+        return np.linspace(0.0, self.motions.duration, count)
+
+    def check(self, phase: Phase, times: np.ndarray) -> CheckedMotion:
+        """Check a phase at times from its start [s]."""
+        stands = phase.stands(times, len(self.motions.legs))
+        return self.checks(phase.motion(times), stands)
+
+    def candidate(
+        self, number: int, coefficients: np.ndarray, times: np.ndarray
+    ) -> Candidate:
+        """Return a phase that is made smaller until it keeps all limits at some times.
+
+        Raises:
+            InputError: If not even the lean and the lift alone keep them.
+        """
+        motions = self.motions
+        checked = None
+        for k in range(MAX_SHRINKAGES + 1):
+            factor = SHRINKAGE**k if k < MAX_SHRINKAGES else 0.0
+            phase = motions.phase(number, factor * coefficients)
+            if phase.spline is None:
+                continue
+            checked = self.check(phase, times)
+            if checked.violation <= 0.0:
+                return Candidate(phase, self.information(phase))
+        raise InputError(
+            f"`{motions.robot.name}` cannot move in phase {number + 1} of "
+            f"{motions.phases} (all feet stand, then each is lifted in its turn), "
+            f"however little it sways: {self._reason(checked)}."
+        )
+
+    def _reason(self, checked: CheckedMotion | None) -> str:
+        """Return which limits a motion exceeds."""
+        if checked is None:
+            return "a leg cannot reach its place; give a `pose` with knees bent more"
+        sentences = [str(x) for x in checked.findings if x.value > 0]
+        largest_use = checked.use.max(axis=0)
+        joint = int(largest_use.argmax())
+        if largest_use[joint] > 1.0:
+            name = self.motions.robot.joint_names[GROUP + joint]
+            sentences.append(f"joint `{name}` exceeds its range, speed or acceleration")
+        return "; ".join(sentences)
+
+    def change(
+        self, number: int, coefficients: np.ndarray, random: np.random.Generator
+    ) -> np.ndarray:
+        """Return coefficients of which some coordinates are drawn anew."""
+        other = self.motions.random(number, random)
+        is_new = random.uniform(size=(len(other), 1)) < CHANGED_SHARE
+        return np.where(is_new, other, random.uniform(0.8, 1.3) * coefficients)
+
+    def plan(
+        self,
+        candidates: Sequence[Candidate],
+        reference: Information,
+        status: DesignStatus,
+        history: list[float],
+    ) -> ExcitationPlan:
+        """Return the result of the search."""
+        motions = self.motions
+        checks = [self.check(x.phase, self.instants) for x in candidates]
+        findings = [
+            max(entries, key=lambda finding: finding.value)
+            for entries in zip(*(x.findings for x in checks), strict=True)
+        ]
+        return ExcitationPlan(
+            base=self.base,
+            trajectory=motions.trajectory([x.phase for x in candidates]),
+            criterion=self.criterion,
+            limits=self.limits,
+            assumed=unknown_limits(self.known_limits),
+            use=np.max([x.use for x in checks], axis=0),
+            information=self.total(candidates),
+            reference=reference,
+            noise=self.noise,
+            samples=self.samples,
+            findings=tuple(findings),
+            status=status,
+            history=np.asarray(history),
+        )
+
+
+def design_on_feet(
+    design: DesignOnFeet,
+    *,
+    starts: int = 32,
+    generations: int = 12,
+    key: PRNGKeyArray | None = None,
+    progress: Callable[[DesignProgress], None] | None = None,
+    begin: MotionOnFeet | None = None,
+    seconds: float | None = None,
+) -> ExcitationPlan:
+    """Search for a motion on feet; arguments are those of `minimise`.
+
+    Raises:
+        InputError: If no motion keeps all limits.
+        KeyboardInterrupt: If Ctrl-C came before a motion kept all limits.
+    """
+    start_time = time.monotonic()
+    duration = math.inf if seconds is None else seconds
+    key = jax.random.key(0) if key is None else key
+    random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
+    motions = design.motions
+    numbers = range(motions.phases)
+    if begin is not None and begin.coefficients.shape[1:] != motions.shape:
+        raise InputError("`begin` must be a motion of the same robot and settings.")
+    first_waves = [motions.random(k, random) for k in numbers]
+    candidates = [design.candidate(k, first_waves[k], design.instants) for k in numbers]
+    design.sizes = typical_sizes(design.total(candidates))
+    reference = design.total(candidates)
+    if begin is not None:
+        waves = np.asarray(begin.coefficients)
+        candidates = [design.candidate(k, waves[k], design.instants) for k in numbers]
+    trajectory = motions.trajectory([x.phase for x in candidates])
+    history = [design.value(candidates)]
+    status = None
+    steps = starts + CHANGES * motions.phases * generations
+    try:
+        for step in range(steps):
+            number = step % motions.phases
+            waves = motions.random(number, random)
+            if step >= starts:
+                earlier_waves = candidates[number].phase.coefficients
+                waves = design.change(number, earlier_waves, random)
+            others = candidates.copy()
+            others[number] = design.candidate(number, waves, motions.times)
+            value = design.value(others)
+            is_better = value < history[-1]
+            if is_better:
+                checked = design.check(others[number].phase, design.instants)
+                is_better = checked.violation <= 0.0
+            if is_better:
+                candidates = others
+                trajectory = motions.trajectory([x.phase for x in candidates])
+            history.append(value if is_better else history[-1])
+            elapsed_time = time.monotonic() - start_time
+            share = min(max((step + 1) / steps, elapsed_time / duration), 1.0)
+            if progress is not None:
+                task = "improving the phases"
+                progress(DesignProgress(share, task, history[-1], True, trajectory))
+            if elapsed_time > duration:
+                break
+    except KeyboardInterrupt:
+        status = DesignStatus.STOPPED
+    if status is None:
+        status = progress_status(history)
+    return design.plan(candidates, reference, status, history)
+
+
+def typical_sizes(information: Information) -> np.ndarray:
+    """Return each parameter's deviation if it were the only one."""
+    squares = np.diag(information.weighted)
+    return 1.0 / np.sqrt(np.where(squares > 0, squares, 1.0))

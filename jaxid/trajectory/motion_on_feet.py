@@ -1,0 +1,53 @@
+"""Motion of a robot on its feet: its driven joints, its trunk, and which feet stand."""
+
+import equinox as eqx
+import numpy as np
+
+from jaxid.arrays import AnyArray, Float
+from jaxid.dynamics.motion import Motion
+
+from .spline import PiecewisePolynomial
+from .trajectory import AbstractTrajectory
+
+
+class MotionOnFeet(AbstractTrajectory):
+    """Motion of the driven joints of a robot on its feet, phase by phase.
+
+    Attributes:
+        path: Motion of all coordinates: of the trunk on the ground, then of the joints.
+        feet: Names of the feet.
+        lifts: Times between which each foot is in the air [s].
+        coefficients: Numbers from which the motion was made, for each phase.
+        trunk_coordinates: Number of the coordinates of the trunk.
+    """
+
+    path: PiecewisePolynomial
+    feet: tuple[str, ...] = eqx.field(static=True)
+    lifts: Float[AnyArray, "feet 2"]
+    coefficients: Float[AnyArray, "phases coordinates variables"]
+    trunk_coordinates: int = eqx.field(static=True, default=6)
+
+    @property
+    def duration(self):
+        """Time from standstill to standstill [s]."""
+        return self.path.duration
+
+    def states(self, t):
+        """Return the motion of the driven joints."""
+        return tuple(x[:, self.trunk_coordinates :] for x in self.path.states(t))
+
+    def motion_on_ground(self, t: AnyArray) -> Motion:
+        """Return the motion of all coordinates at times [s]."""
+        return self.path.motion(t)
+
+    def stands(self, t: AnyArray) -> np.ndarray:
+        """Return whether each foot stands at times [s] [samples feet]."""
+        time = np.asarray(t)[:, None]
+        start, stop = np.asarray(self.lifts).T
+        return ~((time > start) & (time < stop))
+
+    def columns(self, t):
+        """Return whether each foot is to stand, 1 or 0."""
+        flags = self.stands(t).T.astype(float)
+        names = [f"contact_{foot}" for foot in self.feet]
+        return dict(zip(names, flags, strict=True))
