@@ -29,7 +29,6 @@ from floating import (
 from timing import Row, hand_over
 
 import jaxid as jid
-from jaxid.experiment.template import toml_text
 
 jax.config.update("jax_enable_x64", True)
 A1 = GO2._replace(
@@ -46,10 +45,10 @@ SETTLING_TIME = (
 
 def design(robot: Legged, seconds: float) -> Any:
     """Return the motion that the command designs with an experiment file."""
-    contacts = {foot: shape.radius for foot, shape in robot.feet.items()}
+    contacts = [f"{foot} = {shape.radius}" for foot, shape in robot.feet.items()]
     text = (
         f'[robot]\nurdf = "{ROBOTS / robot.path}"\nfloating = true\n'
-        f"contacts = {toml_text(contacts)}\n"
+        f"contacts = {{ {', '.join(contacts)} }}\n"
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "experiment.toml"

@@ -534,7 +534,9 @@ def test_limits_that_nobody_gave_are_named(written, excited):
     (written / "open.toml").write_text(EXPERIMENT.replace("acceleration = [4]", ""))
     robot = load_experiment(written / "open.toml").setup.robot
     limits = JointLimits(robot, excited.plan.trajectory.basis)
-    plan = dataclasses.replace(excited.plan, limits=limits)
+    plan = dataclasses.replace(
+        excited.plan, limits=limits.limits, assumed=limits.assumed
+    )
     said = [remark.text for remark in plan_remarks(plan)]
     assert (
         "The robot's description lacks these limits, so they are assumed: acceleration "

@@ -99,7 +99,7 @@ def write_excitation(
     if isinstance(played, MotionOnFeet):
         # The trunk moves, too.
         scene_robot = with_moving_base(plan.base.model.robot)
-        scene_motion = played.motion_on_ground(time)
+        scene_motion = played.path.motion(time)
     scene = speed_figure(scene_robot, scene_robot.limits, time, scene_motion, shapes)
     all_remarks = sort_remarks((*plan_remarks(plan), *remarks))
     criteria, deviations, *use = plan.tables()

@@ -4,7 +4,7 @@ import equinox as eqx
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
-from jaxid.dynamics.motion import Motion
+from jaxid.robot.virtual_joints import GROUP
 
 from .spline import PiecewisePolynomial
 from .trajectory import AbstractTrajectory
@@ -18,14 +18,12 @@ class MotionOnFeet(AbstractTrajectory):
         feet: Names of the feet.
         lifts: Times between which each foot is in the air [s].
         coefficients: Numbers from which the motion was made, for each phase.
-        trunk_coordinates: Number of the coordinates of the trunk.
     """
 
     path: PiecewisePolynomial
     feet: tuple[str, ...] = eqx.field(static=True)
     lifts: Float[AnyArray, "feet 2"]
     coefficients: Float[AnyArray, "phases coordinates variables"]
-    trunk_coordinates: int = eqx.field(static=True, default=6)
 
     @property
     def duration(self):
@@ -34,11 +32,7 @@ class MotionOnFeet(AbstractTrajectory):
 
     def states(self, t):
         """Return the motion of the driven joints."""
-        return tuple(x[:, self.trunk_coordinates :] for x in self.path.states(t))
-
-    def motion_on_ground(self, t: AnyArray) -> Motion:
-        """Return the motion of all coordinates at times [s]."""
-        return self.path.motion(t)
+        return tuple(x[:, GROUP:] for x in self.path.states(t))
 
     def stands(self, t: AnyArray) -> np.ndarray:
         """Return whether each foot stands at times [s] [samples feet]."""
