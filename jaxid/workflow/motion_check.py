@@ -128,8 +128,7 @@ def check_self_collision(
     surroundings: Surroundings, findings: Sequence[Finding]
 ) -> Iterator[Remark]:
     """Yield whether bodies keep their distance, and which shapes are not known."""
-    shapes = surroundings.shapes
-    for note in () if shapes is None else shapes.notes:
+    for note in surroundings.notes:
         yield Remark(f"self-collision: {note}", Status.DOUBTFUL)
     for fault in surroundings.faults:
         yield Remark(f"self-collision: {fault}", Status.BAD)

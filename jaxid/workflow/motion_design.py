@@ -13,7 +13,7 @@ from jaxid.errors import InputError
 from jaxid.excitation.constraints import AbstractConstraint, TipLimits
 from jaxid.excitation.design import DesignProgress, design_excitation
 from jaxid.excitation.design_result import ExcitationPlan
-from jaxid.excitation.motions_on_feet import Standing
+from jaxid.excitation.motions_on_feet import MotionsOnFeet, Standing
 from jaxid.io import atomic_folder, import_extra
 from jaxid.report.excitation_page import (
     motion_verdict,
@@ -52,7 +52,7 @@ from .nominal_parameters import (
     require_weight,
 )
 from .setup import Progress, Setup, ignore_progress
-from .surroundings import Surroundings
+from .surroundings import Surroundings, compared_on_feet
 
 Improvement = Callable[[LinearTrajectory | MotionOnFeet], None]
 """Callback, called with every better motion that keeps all limits."""
@@ -205,6 +205,12 @@ def prepare_motion(
     task = MotionTask(
         setup, excitation, surroundings, nominal, tuple(constraints), forces.fault
     )
+    if setup.robot.floating:
+        motions = MotionsOnFeet(setup.base, **task.family)
+        surroundings = compared_on_feet(surroundings, motions)
+        clearance = surroundings.clearance
+        near_limits = () if clearance is None else (clearance,)
+        task = task._replace(surroundings=surroundings, constraints=near_limits)
     if earlier_design is None:
         return task
     begin = load_trajectory(earlier_design)

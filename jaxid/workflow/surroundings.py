@@ -9,6 +9,7 @@ import numpy as np
 from jaxid.arrays import Texts
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
+from jaxid.excitation.motions_on_feet import MotionsOnFeet
 from jaxid.robot.capsule_fit import (
     UnreadShapes,
     fit_capsules,
@@ -139,7 +140,8 @@ class Collision:
             # Without shapes of the user, there may be none that can meet.
             if self.capsules or self.boxes or self.pairs:
                 raise
-        return Surroundings(self, clearance, tuple(faults))
+        notes = () if clearance is None else clearance.model.notes
+        return Surroundings(self, clearance, tuple(faults), notes)
 
 
 def fit_links(
@@ -186,12 +188,53 @@ def substitute_capsules(robot: Robot, capsules: Sequence[Capsule]) -> list[Capsu
     return list(stand_in_capsules(robot, sorted(bodies)))
 
 
+def compared_on_feet(
+    surroundings: "Surroundings", motions: MotionsOnFeet
+) -> "Surroundings":
+    """Return the surroundings without pairs that are too near however little it sways.
+
+    Capsules around links are coarse: those of a trunk and of its thighs often overlap.
+    """
+    clearance = surroundings.clearance
+    if clearance is None:
+        return surroundings
+    robot = with_moving_base(motions.robot)
+    is_near = np.zeros(len(clearance.model.groups), bool)
+    for number in range(motions.phases):
+        phase = motions.phase(number, np.zeros(motions.shape))
+        if phase.spline is not None:
+            q = phase.motion(motions.times).q
+            gaps = np.asarray(clearance.model.clearance(robot, q))
+            is_near |= (gaps < clearance.distance).any(axis=0)
+    model = clearance.model
+    names = [shape.name for shape in (*model.capsules, *model.obstacles)]
+    pairs = []
+    for number in np.flatnonzero(~is_near).tolist():
+        for place in model.groups[number]:
+            first, second = model.pairs[place]
+            pairs.append((names[first], names[second]))
+    near_names = [model.pair_names[k] for k in np.flatnonzero(is_near).tolist()]
+    note = (
+        f"not checked, since capsules around them are nearer than "
+        f"{clearance.distance:g} m where the robot only leans and lifts its feet: "
+        f"{', '.join(near_names)}"
+    )
+    if pairs:
+        model = CollisionModel(robot, model.capsules, model.obstacles, pairs)
+        clearance = Clearance(model, clearance.distance)
+    return surroundings._replace(
+        clearance=clearance if pairs else None,
+        notes=(*surroundings.notes, note) if near_names else surroundings.notes,
+    )
+
+
 class Surroundings(NamedTuple):
     """Shapes of robot and surroundings."""
 
     collision: Collision  # what the user says of them
     clearance: Clearance | None  # distance that they must keep; None if there are none
     faults: Texts  # what is not known of them, in sentences
+    notes: Texts = ()  # pairs of shapes that are not compared, in sentences
 
     @property
     def shapes(self) -> CollisionModel | None:
