@@ -164,6 +164,16 @@ def namespace(*arrays: AnyArray) -> ModuleType:
     return jnp if any(isinstance(x, jax.Array) for x in arrays) else np
 
 
+def relative_norm(errors: Iterable[AnyArray], forces: Iterable[AnyArray]) -> float:
+    """Return the norm of errors over that of forces; entries of NaN do not count.
+
+    NaN without any force.
+    """
+    squares = sum(np.nansum(np.asarray(x) ** 2) for x in errors)
+    force_squares = sum(np.nansum(np.asarray(x) ** 2) for x in forces)
+    return float(np.sqrt(squares / (force_squares or np.nan)))
+
+
 def on_cores(
     function: Callable[[Any], Any],
     items: Iterable,

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints, Matrix, Vector
+from jaxid.arrays import AnyArray, Float, Joints, Matrix, Vector, relative_norm
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
@@ -239,9 +239,8 @@ class HeldOutPrediction(NamedTuple):
 
 def relative_error(predictions: Sequence[HeldOutPrediction]) -> float:
     """Return the RMS of all errors over the RMS of all forces."""
-    squares = sum(np.nansum(x.errors**2) for x in predictions)
-    force_squares = sum(np.nansum(x.measured**2) for x in predictions)
-    return float(np.sqrt(squares / force_squares))
+    errors = [x.errors for x in predictions]
+    return relative_norm(errors, [x.measured for x in predictions])
 
 
 def estimate_without_parts(

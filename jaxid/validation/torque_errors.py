@@ -3,12 +3,19 @@
 import dataclasses
 import itertools
 from collections.abc import Mapping, Sequence
-from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Joints, JointSamples, Matrix, Texts, Vector
+from jaxid.arrays import (
+    AnyArray,
+    Joints,
+    JointSamples,
+    Matrix,
+    Texts,
+    Vector,
+    relative_norm,
+)
 from jaxid.identification.estimators import ResidualVariances, WeightedLeastSquares
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.problem import RegressionProblem
@@ -125,11 +132,7 @@ class TorqueErrors(eqx.Module):
     @property
     def relative(self) -> float:
         r"""Norm of all errors over the norm of all forces, $|Wp - Q| / |Q|$."""
-        return float(
-            np.sqrt(
-                _ratio(np.nansum(self.errors**2), np.nansum(self.counted_forces**2))
-            )
-        )
+        return relative_norm([self.errors], [self.counted_forces])
 
     @property
     def counted_forces(self) -> np.ndarray:
@@ -353,22 +356,25 @@ def errors_of_parameters(
 
 def relative_error(logs: Sequence[TorqueErrors]) -> float:
     """Return the RMS error over the RMS force of some logs, as if they were one."""
-    errors = sum(np.nansum(log.errors**2) for log in logs)
-    forces = sum(np.nansum(log.counted_forces**2) for log in logs)
-    return float(np.nan_to_num(np.sqrt(_ratio(errors, forces))))
+    return _relative([log.errors for log in logs], logs)
 
 
 def unexplained_error(logs: Sequence[TorqueErrors]) -> float:
     """Return the relative error that remains if the model is fitted to each log."""
-    errors = sum(np.nansum(np.asarray(log.unexplained) ** 2) for log in logs)
-    forces = sum(np.nansum(log.counted_forces**2) for log in logs)
-    return float(np.nan_to_num(np.sqrt(_ratio(errors, forces))))
+    return _relative([log.unexplained for log in logs], logs)
+
+
+def _relative(errors: Sequence[AnyArray], logs: Sequence[TorqueErrors]) -> float:
+    """Return the norm of errors over that of the forces of all logs; 0 without any."""
+    ratio = relative_norm(errors, [log.counted_forces for log in logs])
+    return float(np.nan_to_num(ratio))
 
 
 def relative_joint_errors(logs: Sequence[TorqueErrors]) -> Vector:
     """Return each joint's RMS error over its RMS force, as if some logs were one."""
-    rms = _pooled_rms(logs)
-    return np.nan_to_num(_ratio(rms.errors, rms.forces))
+    errors = _pooled_rms([log.errors for log in logs])
+    forces = _pooled_rms([log.counted_forces for log in logs])
+    return np.nan_to_num(_ratio(errors, forces))
 
 
 def joint_errors(logs: Sequence[TorqueErrors]) -> Vector:
@@ -378,30 +384,18 @@ def joint_errors(logs: Sequence[TorqueErrors]) -> Vector:
     a joint that hardly works matter little. The largest force is the limit of the
     joint, or that of the logs where no limit is known.
     """
-    rms = _pooled_rms(logs)
     limits = np.asarray(logs[0].max_forces)
-    forces = np.concatenate([log.counted_forces for log in logs])
-    peaks = np.abs(np.nan_to_num(forces)).max(axis=0)
+    forces = [log.counted_forces for log in logs]
+    peaks = np.abs(np.nan_to_num(np.concatenate(forces))).max(axis=0)
     max_forces = np.where(np.isfinite(limits), limits, peaks)
-    duties = np.maximum(rms.forces, MIN_DUTY * max_forces)
-    return np.nan_to_num(_ratio(rms.errors, duties))
+    duties = np.maximum(_pooled_rms(forces), MIN_DUTY * max_forces)
+    errors = _pooled_rms([log.errors for log in logs])
+    return np.nan_to_num(_ratio(errors, duties))
 
 
-class _PooledRms(NamedTuple):
-    """RMS errors and forces of each joint over the rows that count of some logs."""
-
-    errors: Vector
-    forces: Vector
-
-
-def _pooled_rms(logs: Sequence[TorqueErrors]) -> _PooledRms:
-    errors = np.concatenate([log.errors for log in logs])
-    forces = np.concatenate([log.counted_forces for log in logs])
-    rows = np.maximum(np.isfinite(errors).sum(axis=0), 1)
-    return _PooledRms(
-        np.sqrt(np.nansum(errors**2, axis=0) / rows),
-        np.sqrt(np.nansum(forces**2, axis=0) / rows),
-    )
+def _pooled_rms(logs: Sequence[np.ndarray]) -> Vector:
+    """Return the RMS of each joint over the rows that count of some logs; 0 without."""
+    return np.nan_to_num(np.sqrt(_means(np.concatenate(logs) ** 2)))
 
 
 def comparison_step(observations: Observations) -> int:
