@@ -316,6 +316,8 @@ def _require_tables(tables: TomlTable) -> None:
         raise InputError(
             "the table `[robot]` is missing: give it `urdf`, `mjcf` or `builtin`."
         )
+    if "angles" not in tables.get("recording", {"angles": ""}):
+        raise InputError("`recording.angles` is missing: `[recording]` needs it.")
 
 
 def _require_robot(table: TomlTable, folder: Path) -> None:

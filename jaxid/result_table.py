@@ -30,6 +30,20 @@ PADDING = 2
 """Blanks between two columns."""
 MIN_TEXT_WIDTH = 12
 """Characters of a line to which a column of texts may be folded."""
+KINDS = (
+    "result",
+    "comparison",
+    "inspection",
+    "payload",
+    "gains",
+    "states",
+    "demo",
+    "rollout",
+    "agreement",
+    "calibration",
+)
+SCHEMAS = {f"{kind}.json": f"jaxid-{kind}/1" for kind in KINDS}
+"""Files that hold results, and the schemas in them."""
 UNSEEN_CHARACTERS = re.compile(
     r"[\x00-\x08\x0b-\x1f\x7f-\x9f\xad\u200b-\u200f\u2028-\u202e\u2060-\u206f\ufeff\ud800-\udfff]"
 )

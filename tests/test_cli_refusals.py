@@ -143,8 +143,8 @@ for words in sys.stdin.read().splitlines():
     print(code, *loaded, words, file=sys.stderr)
 """
 QUICKLY = [
-    "--help",
-    "identify --help",
+    "-h",
+    "identify -h",
     "--version",
     "idntify",
     "identify experiment.toml",
@@ -174,6 +174,12 @@ QUICKLY = [
     "compare a.csv a.csv",
     "excite experiment.toml -o motion",
     "excite experiment.toml --resume",
+    "identify experiment.toml a.csv -o foreign",
+    "inspect angles.toml a.csv",
+    "gains experiment.toml a.csv --loaded b.csv",
+    "export foreign --to c",
+    "compare foreign a.csv",
+    "agree foreign foreign",
 ]
 
 
@@ -183,6 +189,7 @@ def test_refusals_come_before_jax_is_loaded(folder):  # noqa: F811
         "table": EXPERIMENT.replace("[rows]", "[row]"),
         "key": EXPERIMENT.replace("cutoff", "cut_off"),
         "column": EXPERIMENT.replace("tau{}", "torque{}"),
+        "angles": EXPERIMENT.replace("angles =", "velocities ="),
         "inner": EXPERIMENT + "[model]\ncoulomb = { epsilom = 1 }",
         "kind": EXPERIMENT.replace("cutoff = ", "cutoff = true # "),
         "unit": EXPERIMENT.replace("[recording]", "[recording]\nangle_unit = 'grad'"),
@@ -195,6 +202,8 @@ def test_refusals_come_before_jax_is_loaded(folder):  # noqa: F811
     for name, text in wrong_files.items():
         (folder / f"{name}.toml").write_text(text)
     (folder / "empty.csv").write_text("")
+    (folder / "foreign").mkdir()
+    (folder / "foreign" / "mine.txt").write_text("")
     (folder / "broken.urdf").write_text('<robot name="arm"><link>')
     done = subprocess.run(
         [sys.executable, "-c", LIGHT],

@@ -27,6 +27,7 @@ app = typer.Typer(
     name="jaxid",
     help="Identifies the dynamic parameters of robots: from a log to a model.",
     no_args_is_help=True,
+    context_settings={"help_option_names": ["-h", "--help"]},
     pretty_exceptions_enable=False,
     rich_markup_mode=None,
 )

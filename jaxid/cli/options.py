@@ -16,6 +16,7 @@ from jaxid.experiment_file import (
     require_text_columns,
 )
 from jaxid.measurement.text_format import TEXT_SUFFIXES
+from jaxid.result_table import SCHEMAS
 
 from .terminal import open_console
 
@@ -113,6 +114,7 @@ def start(
     experiment: Path | None = None,
     output: Path | None = None,
     force: bool = False,
+    needs_load: bool = False,
 ) -> Console:
     """Turn on double precision and the cache of compiled code; return the terminal.
 
@@ -125,28 +127,47 @@ def start(
         require_experiment_first(experiment, reads)
         tables = parse_tables(read_experiment_text(experiment), experiment)
         require_text_columns(tables, reads)
-    if output is not None and output.exists() and not output.is_dir():
-        raise InputError(
-            f"`{output}` is a file, but a report needs a folder: choose another -o."
-        )
+        if needs_load and "load" not in tables:
+            raise InputError(
+                f"{experiment.name}: the table `[load]` is missing: "
+                "it describes the load behind `--loaded`."
+            )
+    if output is not None:
+        require_folder_of_report(output, force)
     import jax
 
     from jaxid.io import require_writable
     from jaxid.program.jax_compilation_cache import enable_compilation_cache
-    from jaxid.report.result_files import schema_of
-    from jaxid.report.result_records import SCHEMAS
 
     jax.config.update("jax_enable_x64", True)
     enable_compilation_cache()
     if output is not None:
-        is_empty = not output.is_dir() or not any(output.iterdir())
-        if not (force or is_empty or any(schema_of(output / file) for file in SCHEMAS)):
-            raise InputError(
-                f"`{output}` holds files but no report: "
-                "choose another -o, or add --force."
-            )
         require_writable(output)
     return open_console()
+
+
+def require_folder_of_report(output: Path, force: bool) -> None:
+    """Reject a file, and a folder whose files no command has written."""
+    if not output.exists():
+        return
+    if not output.is_dir():
+        raise InputError(
+            f"`{output}` is a file, but a report needs a folder: choose another -o."
+        )
+    is_empty = not any(output.iterdir())
+    if not (force or is_empty or holds_result(output)):
+        raise InputError(
+            f"`{output}` holds files but no report: choose another -o, or add --force."
+        )
+
+
+def holds_result(folder: Path) -> bool:
+    """Return whether a command has written a result to a folder."""
+    for file in SCHEMAS:
+        path = folder / file
+        if path.is_file() and '"jaxid-' in path.read_text(errors="replace")[:200]:
+            return True
+    return False
 
 
 def file_beside(experiment: Path, output: Path | None, name: str, force: bool) -> Path:
@@ -172,6 +193,17 @@ def require_paths(paths: Sequence[Path]) -> None:
         if len(missing_paths) > 1:
             verb = "do not exist"
         raise InputError(f"{', '.join(missing_paths)} {verb}: check the path.")
+
+
+def require_reports(paths: Sequence[Path]) -> None:
+    """Reject folders that cannot be reports, since they hold no result."""
+    require_paths(paths)
+    for path in paths:
+        if path.is_dir() and not any(path.glob("*.json")):
+            raise InputError(
+                f"`{path}` must be a folder of `jaxid identify`, `rollout` or "
+                "`calibrate`, but holds no result of them."
+            )
 
 
 def require_experiment_first(experiment: Path, logs: Sequence[Path]) -> None:

@@ -2,18 +2,18 @@
 
 import dataclasses
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, cast
 
 import typer
 from rich.console import Console
 
 import jaxid as jid
-from jaxid.errors import InputError
 
 from . import options, terminal
 
 if TYPE_CHECKING:
     from jaxid.report.several_runs_report import RunsReport
+    from jaxid.robot.inertia import Tool
 
 TITLE_OF_LINES = "to use this result for other logs, add to the experiment file:"
 
@@ -77,18 +77,19 @@ def gains(
     file describes the load.
     """
     console = options.start(
-        *logs, *loaded, experiment=experiment, output=output, force=force
+        *logs,
+        *loaded,
+        experiment=experiment,
+        output=output,
+        force=force,
+        needs_load=True,
     )
     content = jid.experiment.load_experiment(experiment)
-    if content.load is None:
-        raise InputError(
-            f"{experiment.name}: the table `[load]` is missing: "
-            "it describes the load behind `--loaded`."
-        )
+    load = cast("Tool | float", content.load)  # required already
     columns = content.require_columns([*logs, *loaded])
     with terminal.progress_bar() as progress:
         report = jid.workflow.identify_gains_from_logs(
-            content.setup, logs, loaded, columns, content.load, progress
+            content.setup, logs, loaded, columns, load, progress
         )
     show_runs(console, detail, report, output, content.text)
 

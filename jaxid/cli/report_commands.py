@@ -56,6 +56,7 @@ def export(
     path = output or Path(EXPORTS[to])
     files = [path, path.with_suffix(".h")] if to == "c" else [path]
     require_no_files(files, to, force)
+    options.require_reports([report])
     console = options.start(report, *([urdf] if urdf else []))
     from jaxid.io import require_writable
     from jaxid.report.result_files import read_faults, read_fit
@@ -160,6 +161,7 @@ def compare(
     """
     if first.resolve() == second.resolve():
         raise InputError(f"`{first}` is given twice: compare two different runs.")
+    options.require_reports([first, second])
     logs = [] if log is None else [log]
     console = options.start(first, second, *logs, output=output, force=force)
     with terminal.progress_bar() as progress:
@@ -186,6 +188,7 @@ def agree(
     The others are pooled into one estimate, whose intervals include the differences
     between runs.
     """
+    options.require_reports(reports)
     console = options.start(*reports, output=output, force=force)
     report = jid.workflow.agree_reports(reports)
     settings = {"command": options.command_line()}

@@ -12,27 +12,13 @@ from jaxid.arrays import AnyArray
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.parameter_changes import Comparison
 from jaxid.identification.uncertainty import Uncertainty
-from jaxid.result_table import Remark, versions
+from jaxid.result_table import SCHEMAS, Remark, versions
 from jaxid.robot.robot import Robot
 from jaxid.validation.judgement import Report, judge
 from jaxid.validation.torque_errors import TorqueErrors
 
 Record = dict[str, Any]
 """Object of a JSON file, or row of a CSV file."""
-KINDS = (
-    "result",
-    "comparison",
-    "inspection",
-    "payload",
-    "gains",
-    "states",
-    "demo",
-    "rollout",
-    "agreement",
-    "calibration",
-)
-SCHEMAS = {f"{kind}.json": f"jaxid-{kind}/1" for kind in KINDS}
-"""Files that hold results, and the schemas in them."""
 
 
 def header(file: str) -> Record:
