@@ -21,6 +21,7 @@ from jaxid.result_table import (
 
 from .combination import require_same_base, without_bounds
 from .fit_result import Fit
+from .run_to_run import inverse_root
 from .uncertainty import Uncertainty
 from .uncertainty.result import dof_of_sum
 
@@ -308,13 +309,9 @@ def joint_test(
         return 0.0, 1.0
     deviations = np.sqrt(np.diag(covariance))
     # Units may differ by orders of magnitude: correlations do not.
-    correlation = covariance / deviations / deviations[:, None]
-    values, directions = np.linalg.eigh(0.5 * (correlation + correlation.T))
-    # Smaller eigenvalues are rounding.
-    is_sound = values > 1e-12 * values[-1]
-    size = int(np.count_nonzero(is_sound))
-    projections = directions.T @ (difference / deviations)
-    statistic = float(np.sum(projections[is_sound] ** 2 / values[is_sound]))
+    correlation = covariance / np.outer(deviations, deviations)
+    root, size = inverse_root(np.asarray(correlation))
+    statistic = float(np.sum((root @ (difference / deviations)) ** 2))
     if not np.isfinite(dof):
         return statistic, float(scipy.special.chdtrc(size, statistic))
     f_dof = dof - size + 1.0

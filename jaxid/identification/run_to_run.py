@@ -106,7 +106,7 @@ def departure(run: Run, others: Runs) -> Departure:
     places = np.ix_(is_determined, is_determined)
     deviations = np.sqrt(variances[is_determined])
     correlation = covariance[places] / np.outer(deviations, deviations)
-    root, size = _inverse_root(correlation)
+    root, size = inverse_root(correlation)
 
     whitening = np.zeros(covariance.shape)
     whitening[places] = root / deviations
@@ -115,7 +115,7 @@ def departure(run: Run, others: Runs) -> Departure:
     return Departure(difference, whitening, size, dof)
 
 
-def _inverse_root(correlation: Matrix) -> tuple[Matrix, int]:
+def inverse_root(correlation: Matrix) -> tuple[Matrix, int]:
     """Return the symmetric inverse root of a correlation, and its rank.
 
     A symmetric root turns nothing: directions of different runs are alike.
