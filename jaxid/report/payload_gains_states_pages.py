@@ -3,6 +3,7 @@
 import dataclasses
 import json
 from collections.abc import Mapping, Sequence
+from itertools import cycle
 
 import numpy as np
 
@@ -224,12 +225,21 @@ def state_friction_figure(
 ) -> Figure:
     """Return the friction of each joint against speed, of all states in one panel."""
     panels: dict[str, Panel] = {}
-    for (state, fit), colour in zip(fits.items(), CYCLE, strict=False):
+    curves: dict[str, list[Curve]] = {}
+    for (state, fit), colour in zip(fits.items(), cycle(CYCLE), strict=False):
         for panel in friction_figure(fit, errors[state]).panels:
-            curves = list(panels[panel.title].curves) if panel.title in panels else []
-            for curve, name in zip(
-                panel.curves[-2:], (state, f"{state}, measured"), strict=True
-            ):
-                curves.append(dataclasses.replace(curve, name=name, colour=colour))
-            panels[panel.title] = dataclasses.replace(panel, curves=curves, value="")
-    return Figure("Friction of the states", list(panels.values()), min(3, len(panels)))
+            panels.setdefault(panel.title, panel)
+            model, measured = panel.curves[-2:]
+            curves.setdefault(panel.title, []).extend(
+                [
+                    dataclasses.replace(model, name=state, colour=colour),
+                    dataclasses.replace(
+                        measured, name=f"{state}, measured", colour=colour
+                    ),
+                ]
+            )
+    merged_panels = [
+        dataclasses.replace(panel, curves=curves[title], value="")
+        for title, panel in panels.items()
+    ]
+    return Figure("Friction of the states", merged_panels, min(3, len(panels)))

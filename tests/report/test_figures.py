@@ -17,6 +17,7 @@ from jaxid.report.browser_figures import charts, library
 from jaxid.report.figure_elements import BLUE, ORANGE, decimate
 from jaxid.report.motion_figures import pose_figure
 from jaxid.report.parameter_words import in_words
+from jaxid.report.payload_gains_states_pages import state_friction_figure
 from jaxid.robot.collision import GROUND, Box, Capsule, CollisionModel, HalfSpace
 
 T = np.linspace(0.0, 2.0, 101)
@@ -265,6 +266,15 @@ def test_motions_are_drawn_between_their_limits(motion):
         ):
             np.testing.assert_array_equal(part.curves[0].y, values[:, j])
         assert [len(part.levels) for part in panel.parts] == [0, 2 - 2 * j, 0]
+
+
+def test_friction_of_more_states_than_colours_is_shown(fit, validation):
+    states = [f"state {k}" for k in range(9)]
+    figure = state_friction_figure(
+        dict.fromkeys(states, fit), dict.fromkeys(states, validation.errors)
+    )
+    for panel in figure.panels:
+        assert [curve.name for curve in panel.curves[::2]] == states
 
 
 def test_friction_is_that_of_the_estimates_and_of_the_log(fit, validation):
