@@ -66,4 +66,6 @@ def torque_program(fit: Fit) -> Program:
     Args:
         fit: Identified model.
     """
-    return trace(torques(fit), *fit.base.model.input_shapes)
+    model = fit.base.model
+    shapes = [(model.robot.joints,), *model.input_shapes[1:]]
+    return trace(torques(fit), *shapes)

@@ -295,6 +295,20 @@ def test_a_written_mjcf_file_closes_the_same_loops(path):
 
 
 @pytest.mark.parametrize("mechanism", [MECHANISMS["slider"]])
+def test_the_exported_function_takes_the_coordinates_of_the_motors(path):
+    robot, p = jid.load_mjcf(path), urdf_parameters(path)
+    terms = jid.RigidBodies(), jid.ViscousFriction()
+    base = jid.base_parameters(jid.Model(robot, terms))
+    motion = motion_of(robot, 0.5, 60)
+    forces = base.model.inverse_dynamics(np.append(p, 2.0), motion)
+    arrays = motion.q, motion.qd, motion.qdd
+    observations = jid.Observations.of(*arrays, forces, sample_time=0.01)
+    fit = jid.identify(base, observations)
+    exported = jid.export.exported_function(fit)
+    np.testing.assert_allclose(exported.call(*arrays), forces, atol=1e-6)
+
+
+@pytest.mark.parametrize("mechanism", [MECHANISMS["slider"]])
 def test_designs_keep_away_from_singular_poses_and_limits_of_passive_joints(path):
     text = path.read_text().replace('type="slide"', 'type="slide" range="-.2 .4"')
     path.write_text(text)
