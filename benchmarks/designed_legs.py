@@ -104,12 +104,6 @@ def compare(name: str, seconds: float) -> list[Row]:
     flags = wrong_flags(log, motion, times)
     rows = [
         ("upright: least cosine of the tilt", "0.9", f"{lowest:.3f}", lowest > 0.9),
-        (
-            "largest slip of a standing foot",
-            "10 mm",
-            f"{1e3 * shift:.1f}",
-            shift < 0.01,
-        ),
         ("flags not as planned", "2 %", f"{100 * flags:.2f} %", flags < 0.02),
         ("torque, of the largest", "1", f"{used_torque:.2f}", used_torque < 1.0),
     ]

@@ -100,7 +100,7 @@ def feet_of(data):
     return data.site_xpos[sites].copy()
 
 
-def simulate(seed, lifted_legs):
+def simulate(seed, lifted_legs, motion=None):
     """Return angles, torques, gyroscope, accelerometer and flags of a motion."""
     random = np.random.default_rng(seed)
     sway_rates, sway_phases = random.uniform(
@@ -110,7 +110,11 @@ def simulate(seed, lifted_legs):
         [[[0.5]], [[0]]], [[[2.5]], [[6]]], (2, 12, 4)
     )
     data, reference = mujoco.MjData(model), mujoco.MjData(model)
-    data.qpos[7:] = reference.qpos[7:] = STAND
+    count, planned = int(1000 * PHASE * (1 + len(lifted_legs))), [STAND]
+    if motion is not None:
+        count = int(1000 * motion.duration)
+        planned = np.asarray(motion.motion(0.001 * np.arange(count)).q)
+    data.qpos[7:] = reference.qpos[7:] = planned[0]
     stand = feet_of(data)
     data.qpos[2] = 0.022 - stand[0, 2]
     angles, samples = STAND, []
@@ -142,9 +146,9 @@ def simulate(seed, lifted_legs):
             angles[joints] += lift * (FOLD + 0.22 * swing[joints])
         return angles
 
-    for k in range(int(1000 * PHASE * (1 + len(lifted_legs)))):
+    for k in range(count):
         if k % 5 == 0:
-            angles = follow(0.001 * k)
+            angles = follow(0.001 * k) if motion is None else planned[k]
         torques = 120.0 * (angles - data.qpos[7:]) - 2.5 * data.qvel[6:]
         data.ctrl[:] = np.clip(torques, -40.0, 40.0)
         q = data.qpos[7:].copy()
@@ -162,9 +166,9 @@ HEADER = ",".join(f"{key}{k + 1}" for key, n in KEYS.items() for k in range(n))
 folder = Path(tempfile.mkdtemp())
 
 
-def record(seed, lifted_legs, name):
+def record(seed, lifted_legs, name, motion=None):
     """Write a log with noise as a file, and return its place."""
-    samples = simulate(seed, lifted_legs)
+    samples = simulate(seed, lifted_legs, motion)
     samples = samples + NOISE * np.random.default_rng(seed).normal(size=samples.shape)
     np.savetxt(folder / name, samples, delimiter=",", header=HEADER, comments="")
     return folder / name
@@ -278,11 +282,54 @@ for name, result in (("each foot lifted", fit), ("all feet stand", stance.fit)):
 # %% [markdown]
 # Each fraction is the number of base parameters that can be trusted, first of the trunk and then of each leg.
 #
+# ## A designed motion
+#
+# `jaxid excite` designs the motion from nominal parameters, here the masses of the file: the trunk moves on all feet, then one foot after another is lifted. It keeps the
+# zero-moment point inside the feet that stand. Random motions of each phase are changed as long as they determine the parameters better.
+
+# %%
+bodies = np.asarray(jid.robots.urdf_parameters(path, floating=True))
+nominal = np.zeros(base.model.size)
+nominal[: len(bodies)] = bodies
+standing = jid.excitation.Standing(base.from_standard(nominal), force_margin=0.3)
+plan = jid.design_excitation(
+    base, standing=standing, harmonics=20, omega=0.8, starts=20, generations=3
+)
+motion = plan.trajectory
+print(*plan.findings[:3], *plan.remarks, sep="\n")
+
+# %%
+t = np.arange(0, float(motion.duration), 0.01)
+figure, (upper, lower) = plt.subplots(
+    2, 1, figsize=(11, 3.8), sharex=True, height_ratios=[1, 3]
+)
+for k, leg in enumerate(LEGS):
+    upper.fill_between(t, 3.1 - k, 3.9 - k, where=motion.stands(t)[:, k], color=f"C{k}")
+    lower.plot(t, motion.motion(t).q[:, 3 * k + 2], color=f"C{k}", lw=0.7, label=leg)
+upper.set_yticks([3.5, 2.5, 1.5, 0.5], LEGS)
+upper.set_title("planned to stand")
+lower.set_ylabel("knee [rad]")
+lower.set_xlabel("time [s]")
+lower.legend(ncols=4)
+plt.show()
+
+# %% [markdown]
+# Played by the same controllers, it makes the intervals smaller than the motion made by hand. It takes twice as long, which alone makes them 1.4 times smaller.
+
+# %%
+designed = record(1, [], "designed.csv", motion)
+better = jid.identify_logs(setup, [designed], columns, verify=[other]).fit
+print("total mass: {:.3f} ± {:.3f} kg".format(*total_mass(better)))
+ratios = fit.uncertainty.half_widths() / better.uncertainty.half_widths()
+print(f"intervals, by hand over designed: {np.exp(np.log(ratios).mean()):.2f} (mean)")
+
+# %% [markdown]
 # ## What you learned
 #
 # * Gyroscope, accelerometer and flags of contact replace the force sensors of a fixed base: no contact force, attitude or velocity is needed.
 # * Move the trunk while all feet stand, and lift one foot after another.
 # * The report says whether the drives of the legs agree.
+# * `jaxid excite` designs such a motion, with limits and balance.
 #
 # The guide: [robots on legs](../docs/floating_base.md).
 #

@@ -189,6 +189,13 @@ class ExcitationPlan(Summarised, eqx.Module):
         is_open = ~(self.standard_deviations * column_rms <= MAX_OPEN_NOISE)
         return tuple(self.base.names[k] for k in np.flatnonzero(is_open))
 
+    @property
+    def occasion(self) -> str:
+        """When the limits of the joints were compared with the motion."""
+        if self.base.model.robot.floating:
+            return "at the instants that were checked"
+        return "at all times"
+
     def tables(self) -> tuple[Table, ...]:
         """Return the tables of criteria, expected deviations, and use of the limits."""
         tables = (
@@ -228,7 +235,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         for kind, use in zip(kinds, self.use, strict=True):
             if (use > 0).any():
                 columns.append(Column(kind, 100 * use, "%", "{:.1f}".format))
-        return Table("use of the limits, at all times", *columns)
+        return Table(f"use of the limits, {self.occasion}", *columns)
 
     @property
     def remarks(self) -> list[Remark]:

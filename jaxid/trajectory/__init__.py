@@ -17,6 +17,7 @@ from .lead_in_and_out import (
     WithLeads as WithLeads,
     with_leads as with_leads,
 )
+from .motion_on_feet import MotionOnFeet as MotionOnFeet
 from .prescribed_tip_path import (
     TipPath as TipPath,
     circle as circle,

@@ -66,7 +66,7 @@ def check_joints(plan: ExcitationPlan) -> Remark:
         text = f"{quantities}: limits are exceeded by {100 * excess:.2g} %"
         return Remark(text, Status.BAD)
     return Remark(
-        f"{quantities}: all joints keep their limits at all times", Status.GOOD
+        f"{quantities}: all joints keep their limits {plan.occasion}", Status.GOOD
     )
 
 
