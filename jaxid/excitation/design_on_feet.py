@@ -42,6 +42,8 @@ MAX_SHRINKAGES = 12
 """Times that it is; then it becomes a motion without waves."""
 CHANGED_SHARE = 0.3
 """Share of the coordinates that a change of a motion replaces."""
+MIN_DURATION = 1e-3
+"""Duration of a search whose time was over before it began [s]."""
 CHANGES = 4
 """Changes of each phase in a generation."""
 
@@ -188,13 +190,20 @@ class DesignOnFeet:
             sentences.append(f"joint `{name}` exceeds its range, speed or acceleration")
         return "; ".join(sentences)
 
+    def candidates(self, waves: Sequence[np.ndarray]) -> list[Candidate]:
+        """Return a candidate of each phase, which keeps its limits on a fine grid."""
+        return [self.candidate(k, x, self.instants) for k, x in enumerate(waves)]
+
+    def keeps_limits(self, phase: Phase) -> bool:
+        """Return whether a phase keeps its limits on a fine grid."""
+        return self.check(phase, self.instants).violation <= 0.0
+
     def change(
-        self, number: int, coefficients: np.ndarray, random: np.random.Generator
+        self, waves: np.ndarray, new_waves: np.ndarray, random: np.random.Generator
     ) -> np.ndarray:
-        """Return coefficients of which some coordinates are drawn anew."""
-        other = self.motions.random(number, random)
-        is_new = random.uniform(size=(len(other), 1)) < CHANGED_SHARE
-        return np.where(is_new, other, random.uniform(0.8, 1.3) * coefficients)
+        """Return waves of which some coordinates are replaced, the others scaled."""
+        is_new = random.uniform(size=(len(waves), 1)) < CHANGED_SHARE
+        return np.where(is_new, new_waves, random.uniform(0.8, 1.3) * waves)
 
     def plan(
         self,
@@ -244,42 +253,37 @@ def design_on_feet(
         KeyboardInterrupt: If Ctrl-C came before a motion kept all limits.
     """
     start_time = time.monotonic()
-    duration = math.inf if seconds is None else seconds
+    duration = math.inf if seconds is None else max(seconds, MIN_DURATION)
     key = jax.random.key(0) if key is None else key
     random = np.random.default_rng(np.asarray(jax.random.key_data(key)))
     motions = design.motions
     numbers = range(motions.phases)
-    if begin is not None and begin.coefficients.shape[1:] != motions.shape:
+    shape = (motions.phases, *motions.shape)
+    if begin is not None and begin.coefficients.shape != shape:
         raise InputError("`begin` must be a motion of the same robot and settings.")
-    first_waves = [motions.random(k, random) for k in numbers]
-    candidates = [design.candidate(k, first_waves[k], design.instants) for k in numbers]
+    waves = [motions.random(number, random) for number in numbers]
+    candidates = design.candidates(waves)
     design.sizes = typical_sizes(design.total(candidates))
     reference = design.total(candidates)
     if begin is not None:
-        waves = np.asarray(begin.coefficients)
-        candidates = [design.candidate(k, waves[k], design.instants) for k in numbers]
+        candidates = design.candidates([*np.asarray(begin.coefficients)])
     trajectory = motions.trajectory([x.phase for x in candidates])
     history = [design.value(candidates)]
-    status = None
     steps = starts + CHANGES * motions.phases * generations
     try:
         for step in range(steps):
             number = step % motions.phases
-            waves = motions.random(number, random)
+            new_waves = motions.random(number, random)
             if step >= starts:
-                earlier_waves = candidates[number].phase.coefficients
-                waves = design.change(number, earlier_waves, random)
+                waves = candidates[number].phase.coefficients
+                new_waves = design.change(waves, new_waves, random)
             others = candidates.copy()
-            others[number] = design.candidate(number, waves, motions.times)
+            others[number] = design.candidate(number, new_waves, motions.times)
             value = design.value(others)
-            is_better = value < history[-1]
-            if is_better:
-                checked = design.check(others[number].phase, design.instants)
-                is_better = checked.violation <= 0.0
-            if is_better:
+            if value < history[-1] and design.keeps_limits(others[number].phase):
                 candidates = others
                 trajectory = motions.trajectory([x.phase for x in candidates])
-            history.append(value if is_better else history[-1])
+            history.append(design.value(candidates))
             elapsed_time = time.monotonic() - start_time
             share = min(max((step + 1) / steps, elapsed_time / duration), 1.0)
             if progress is not None:
@@ -288,10 +292,8 @@ def design_on_feet(
             if elapsed_time > duration:
                 break
     except KeyboardInterrupt:
-        status = DesignStatus.STOPPED
-    if status is None:
-        status = progress_status(history)
-    return design.plan(candidates, reference, status, history)
+        return design.plan(candidates, reference, DesignStatus.STOPPED, history)
+    return design.plan(candidates, reference, progress_status(history), history)
 
 
 def typical_sizes(information: Information) -> np.ndarray:

@@ -96,7 +96,8 @@ class ExcitationPlan(Summarised, eqx.Module):
         use: Used fraction of the limits of position, speed, acceleration and jerk.
         information: Information of one run of the motion.
         reference: Information of a random motion that keeps the same limits, as far as
-            any was found: the median of the motions from which the search started.
+            any was found: the median of the motions from which the search started; the
+            first one of a robot on its feet.
         noise: Assumed standard deviation of the forces' noise by joint [N m or N].
         samples: Number of measured samples of one run.
         findings: Use of the constraints beside the limits of the joints.
