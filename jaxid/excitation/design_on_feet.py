@@ -38,6 +38,8 @@ GUARD = 0.5
 """Time around a change of contact whose samples are not counted on [s]."""
 SHRINKAGE = 0.8
 """Factor by which a motion is made smaller until it keeps all limits."""
+FOOT_EXPONENT = 0.5
+"""Power of this factor for a foot in the air, whose motion shakes the trunk less."""
 MAX_SHRINKAGES = 12
 """Times that it is; then it becomes a motion without waves."""
 CHANGED_SHARE = 0.3
@@ -87,8 +89,14 @@ class DesignOnFeet:
         self.base = base
         self.motions = MotionsOnFeet(base, standing, harmonics, omega)
         joints = driven_robot(base.model.robot)
-        self.known_limits = joints.limits if limits is None else limits
-        self.limits = complete_limits(joints.replace(limits=self.known_limits))
+        known_limits = joints.limits if limits is None else limits
+        complete = complete_limits(joints.replace(limits=known_limits))
+        # Accelerations that nobody has given are limited by the torques alone.
+        acceleration = known_limits.acceleration
+        self.limits = dataclasses.replace(complete, acceleration=acceleration)
+        self.assumed_limits = tuple(
+            x for x in unknown_limits(known_limits) if x[0] != "acceleration"
+        )
         self.checks = ChecksOnFeet(self.motions, self.limits, constraints)
         self.criterion = DOptimal() if criterion is None else criterion
         joint_noise = assumed_noise(joints) if noise is None else np.asarray(noise)
@@ -107,6 +115,8 @@ class DesignOnFeet:
         self.samples = samples
         self.prior = 0.0 if prior is None else np.asarray(prior)
         self.sizes = np.ones(base.size)
+        # Times that random motions of each phase are made smaller from the outset.
+        self.shrinkages = [0] * self.motions.phases
         self._value = jax.jit(self.criterion)
 
     def information(self, phase: Phase) -> Information:
@@ -154,6 +164,12 @@ class DesignOnFeet:
         stands = phase.stands(times, len(self.motions.legs))
         return self.checks(phase.motion(times), stands)
 
+    def shrunk(self, waves: np.ndarray, times: int) -> np.ndarray:
+        """Return waves that are made smaller some times, those of the foot less."""
+        factors = np.full((len(waves), 1), SHRINKAGE**times)
+        factors[-GROUP:] **= FOOT_EXPONENT
+        return factors * waves
+
     def candidate(
         self, number: int, coefficients: np.ndarray, times: np.ndarray
     ) -> Candidate:
@@ -165,12 +181,16 @@ class DesignOnFeet:
         motions = self.motions
         checked = None
         for k in range(MAX_SHRINKAGES + 1):
-            factor = SHRINKAGE**k if k < MAX_SHRINKAGES else 0.0
-            phase = motions.phase(number, factor * coefficients)
+            smaller_waves = self.shrunk(coefficients, k)
+            if k == MAX_SHRINKAGES:
+                smaller_waves = np.zeros_like(coefficients)
+            phase = motions.phase(number, smaller_waves)
             if phase.spline is None:
                 continue
             checked = self.check(phase, times)
             if checked.violation <= 0.0:
+                shrinkages = self.shrinkages[number] + k - 1
+                self.shrinkages[number] = max(shrinkages, 0)
                 return Candidate(phase, self.information(phase))
         raise InputError(
             f"`{motions.robot.name}` cannot move in phase {number + 1} of "
@@ -224,7 +244,7 @@ class DesignOnFeet:
             trajectory=motions.trajectory([x.phase for x in candidates]),
             criterion=self.criterion,
             limits=self.limits,
-            assumed=unknown_limits(self.known_limits),
+            assumed=self.assumed_limits,
             use=np.max([x.use for x in checks], axis=0),
             information=self.total(candidates),
             reference=reference,
@@ -274,6 +294,7 @@ def design_on_feet(
         for step in range(steps):
             number = step % motions.phases
             new_waves = motions.random(number, random)
+            new_waves = design.shrunk(new_waves, design.shrinkages[number])
             if step >= starts:
                 waves = candidates[number].phase.coefficients
                 new_waves = design.change(waves, new_waves, random)
