@@ -412,10 +412,10 @@ def _follower_notes(tree: UrdfTree):
         )
     names = [x.name for x in tree.followers[len(led_followers) :]]
     if names:
-        first = first_number + len(led_followers)
         yield (
-            f"{owners('joint', names)}: closed loops move what has no motor; the "
-            f"bodies have the numbers {first} to {len(tree.joints)}, in this order."
+            f"{owners('joint', names)}: closed loops move these; bodies "
+            f"{first_number + len(led_followers)} to {len(tree.joints)} are theirs; "
+            f"the end-effector is `{tree.tip}`: if it is another link, name it (`tip`)."
         )
 
 
