@@ -77,6 +77,7 @@ METHODS = (
     Script("calibration", 6),
     Script("force_sensor", 10),
     Script("floating", 10),
+    Script("designed_legs", 12),
     Script("transients", 1),
     Script("excitation", 60),
     Script("safe_motions", 40),
