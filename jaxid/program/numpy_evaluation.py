@@ -33,9 +33,6 @@ MAX_LENGTH = 200
 """Number of characters up to which an expression is written within another one."""
 BLOCK = 2048
 """Samples at a time, so that intermediate values stay in the processor's cache."""
-PADDING = 8
-"""Numbers between the rows of a result: without them it is transposed at a third of
-the speed where a power of two samples were computed."""
 
 
 class Plan(NamedTuple):
@@ -64,9 +61,7 @@ def packed_entries(
     """Return some entries [entries, samples] of the packed result."""
     numbers = program.distinct[1][entries]
     is_varying = numbers >= 0
-    samples = rows.shape[1]
-    # Rows a power of two apart would share few places of the processor's cache.
-    values = np.empty((len(entries), samples + PADDING))[:, :samples]
+    values = np.empty((len(entries), rows.shape[1]))
     values[is_varying] = rows[numbers[is_varying]]
     constants = [program.outputs[k] for k in entries[~is_varying]]
     values[~is_varying] = np.array(constants, float)[:, None]
