@@ -63,6 +63,7 @@ SPEED = (
     Script("batches", 2),
     Script("scaling", 8),
     Script("large_trees", 12),
+    Script("compile_robots", 90),
     Script("gpu", 2),
 )
 METHODS = (
