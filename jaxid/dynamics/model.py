@@ -177,7 +177,9 @@ class Model(Hashable):
         Where a motion does not have the state of friction with memory, its samples are
         a path in the order of time; without that of contacts, no foot stands.
         """
-        q = self.closed(motion.q)
+        # A look-up of a method takes longer than checking a few numbers.
+        check = self.closed if self.robot.loops else self.check
+        q = check(motion.q)
         law = self.memory
         state = motion.state
         if law is not None and state is None:
