@@ -345,11 +345,16 @@ def _solve_by_cofactors(A: Array, b: Array):
     n = len(A)
     missing = MAX_JOINTS_OF_COFACTORS - n
     ones = np.diag([0.0] * n + [1.0] * missing)
-    x, y, z = jnp.pad(A, (0, missing)).T + jnp.asarray(ones, A.dtype)
-    cofactors = jnp.stack([jnp.cross(y, z), jnp.cross(z, x), jnp.cross(x, y)])
-    value = x @ cofactors[0]
-    factor = value / (value * value + SMALLEST_SQUARE_OF_DETERMINANT)
-    return jnp.tensordot(cofactors[:n, :n], b, 1) * factor
+    columns = jnp.pad(A, (0, missing)).T + jnp.asarray(ones, A.dtype)
+    x, y, z = columns
+    first_cofactors = jnp.cross(y, z)
+    second_cofactors = jnp.cross(z, x)
+    third_cofactors = jnp.cross(x, y)
+    cofactors = jnp.stack([first_cofactors, second_cofactors, third_cofactors])
+    value = x @ first_cofactors
+    square = value * value + SMALLEST_SQUARE_OF_DETERMINANT
+    products = jnp.tensordot(cofactors[:n, :n], b, 1)
+    return products * (value / square)
 
 
 def loop_closure(robot: Any, coordinates: Joints) -> Array:
