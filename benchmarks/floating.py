@@ -10,6 +10,7 @@ motion and a noise of its own; settings are those of `jaxid identify`.
     python benchmarks/floating.py                   # Go2: half an hour
     python benchmarks/floating.py --quick
     python benchmarks/floating.py --lifts           # what each lifted foot tells
+    python benchmarks/floating.py --imu             # an IMU that is not as described
     python benchmarks/floating.py --robot G1        # or "ANYmal C"; --all for all
 """
 
@@ -576,6 +577,71 @@ def quadruped(name: str, draws: int, seconds: float) -> list[Row]:
     return [Row("43", f"{name}: {what}", recipe, *rest) for what, *rest in values]
 
 
+class Mounting(NamedTuple):
+    """An IMU that is mounted otherwise than described, in the frame of the base."""
+
+    turn: tuple[float, ...] = (0.0, 0.0, 0.0)  # roll, pitch and yaw [deg]
+    place: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m]
+    gyro_bias: tuple[float, ...] = (0.0, 0.0, 0.0)  # [rad/s]
+    accelerometer_bias: tuple[float, ...] = (0.0, 0.0, 0.0)  # [m/s²]
+
+    def measured(self, log: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+        """Return a log without noise as this IMU measures it."""
+        R = pin.rpy.rpyToMatrix(np.deg2rad(self.turn))
+        rates, place = log["gyro"], np.array(self.place)
+        changes = np.gradient(rates, SAMPLE_TIME, axis=0)
+        accelerations = log["accelerometer"] + np.cross(changes, place)
+        accelerations = accelerations + np.cross(rates, np.cross(rates, place))
+        gyro = rates @ R + self.gyro_bias
+        accelerometer = accelerations @ R + self.accelerometer_bias
+        return log | {"gyro": gyro, "accelerometer": accelerometer}
+
+
+MOUNTINGS = {
+    "as described": Mounting(),
+    "gyroscope, bias of 0.01 rad/s": Mounting(gyro_bias=(0.006, -0.006, 0.0055)),
+    "gyroscope, bias of 0.05 rad/s": Mounting(gyro_bias=(0.03, -0.03, 0.026)),
+    "accelerometer, bias of 0.1 m/s²": Mounting(
+        accelerometer_bias=(0.06, -0.06, 0.053)
+    ),
+    "accelerometer, bias of 0.3 m/s²": Mounting(accelerometer_bias=(0.18, -0.17, 0.17)),
+    "turned by 2 degrees": Mounting(turn=(1.2, -1.2, 1.1)),
+    "turned by 90 degrees about z": Mounting(turn=(0.0, 0.0, 90.0)),
+    "turned by 180 degrees about z": Mounting(turn=(0.0, 0.0, 180.0)),
+    "turned by 90 degrees about x": Mounting(turn=(90.0, 0.0, 0.0)),
+    "displaced by 5 cm": Mounting(place=(0.03, 0.03, 0.026)),
+}
+
+
+def imu_rows(name: str, seconds: float) -> list[Row]:
+    """Return what an IMU costs that is not as described, and what its estimate leaves.
+
+    The estimate is that of `imu_offset = true`.
+    """
+    study = Study(QUADRUPEDS[name], seconds)
+    log = study.log(1)
+    rows = []
+    for what, mounting in MOUNTINGS.items():
+        texts = []
+        for imu_offset in (False, True):
+            reading = jid.workflow.LogReading(imu_offset=imu_offset)
+            setup = jid.Setup(study.base, reading=reading)
+            with tempfile.TemporaryDirectory() as folder:
+                path = write(mounting.measured(log), Path(folder) / "log.csv", 5)
+                report = jid.identify_logs(setup, [path], COLUMNS)
+            named = [text for text in report.doubts if "IMU" in text]
+            mass, error = study.mass(report.fit)[0], study.torque_error(report.fit)
+            word = "named" if named else "not named"
+            texts.append(f"{mass:.3f} kg, {100 * error:.2f} %, {word}")
+        recipe = f"floating.py --imu, one log of {seconds:g} s"
+        text = f"{texts[0]}; estimated: {texts[1]}"
+        print(what, text, flush=True)
+        rows.append(
+            Row("43", f"{name}: IMU {what}: total mass, error", recipe, "-", text)
+        )
+    return rows
+
+
 def load_and_flags(study: Study, empty: jid.Fit, error: float) -> list[tuple]:
     """Return what a load on the back weighs, and what wrong flags do."""
     load = pin.Inertia(0.5, np.array([0.1, 0.02, 0.09]), np.diag([1e-3] * 3))
@@ -618,6 +684,7 @@ if __name__ == "__main__":
     parser.add_argument("--robot", default="Go2", choices=[*QUADRUPEDS, "G1"])
     parser.add_argument("--all", action="store_true", help="all robots")
     parser.add_argument("--lifts", action="store_true", help="what each foot tells")
+    parser.add_argument("--imu", action="store_true", help="an IMU not as described")
     parser.add_argument("--json")
     options = parser.parse_args()
     draws, seconds = (2, 24.0) if options.quick else (options.draws, 40.0)
@@ -626,7 +693,9 @@ if __name__ == "__main__":
         raise SystemExit
     rows = []
     for name in [*QUADRUPEDS, "G1"] if options.all else [options.robot]:
-        if name == "G1":
+        if options.imu and name != "G1":
+            rows += imu_rows(name, seconds)
+        elif name == "G1":
             rows += humanoid(seconds)
         else:
             rows += quadruped(name, draws, seconds)

@@ -163,6 +163,7 @@ KEYS: dict[str, TomlTable] = {
         "bad_rows": Annotated[float, Bounds(minimum=0.0, below=1.0)],
         "start": float,
         "stop": float,
+        "imu_offset": bool,
     },
     "filter": {
         "kind": Literal["butterworth", "paper", "periodic"],

@@ -16,7 +16,6 @@ from jaxid.dynamics.contact_elimination import elimination
 from jaxid.dynamics.motion import Motion, floating_motion
 from jaxid.errors import InputError
 from jaxid.robot.contacts import legs_of
-from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
 
@@ -178,38 +177,20 @@ def all_standing(recording: Recording, robot: Robot) -> Recording:
     return dataclasses.replace(recording, base=signals)
 
 
-def measured_vertical(recording: Recording, robot: Robot) -> tuple[np.ndarray, float]:
-    """Return the vertical in the frame of the base, and the mean acceleration [m/s²].
-
-    The vertical is that of all samples [samples 3], as if there were no gaps.
-    """
+def measured_gravity(recording: Recording, robot: Robot) -> float:
+    """Return the mean acceleration along the vertical [m/s²], as if without gaps."""
     signals = base_of(recording, robot)
     attitude = rpy_rotation(robot.imu.rpy)
     rates = np.asarray(signals.rates) @ attitude.T
     accelerations = np.asarray(signals.accelerations) @ attitude.T
     up = vertical(rates, accelerations, recording.sample_time)
-    return up, float(np.mean(np.sum(up * accelerations, axis=1)))
+    return float(np.mean(np.sum(up * accelerations, axis=1)))
 
 
-def feet_normal(recording: Recording, robot: Robot) -> np.ndarray | None:
-    """Return the normal of the plane of the feet where all stand [samples 3].
-
-    None for fewer than three feet, or where they never stand together.
-    """
-    stands = base_of(recording, robot).stands.all(axis=1)
-    if len(robot.contacts) < 3 or not stands.any():
-        return None
-    measured_forces = np.asarray(recording.forces)
-    q, _, _ = joint_side(robot, recording, recording.angles, None, measured_forces)
-    angles = np.zeros((np.count_nonzero(stands), robot.joints))
-    angles[:, list(robot.driven)] = q[stands]
-    points = []
-    for contact in robot.contacts:
-        foot = robot.replace(tip_body=contact.body, tip_offset=contact.position)
-        points.append(tip_jacobian(foot, angles).position)
-    feet = np.stack(points, axis=1)
-    feet = feet - feet.mean(axis=1, keepdims=True)
-    normal = np.linalg.svd(feet)[2][:, 2]
+def plane_normal(feet: Float[np.ndarray, "samples feet 3"]) -> np.ndarray:
+    """Return the normal of the plane of the feet, towards the base [samples 3]."""
+    deviations = feet - feet.mean(axis=1, keepdims=True)
+    normal = np.linalg.svd(deviations)[2][:, 2]
     # The base is above the feet.
-    height = np.sum(normal * points[0], axis=1, keepdims=True)
+    height = np.sum(normal * feet[:, 0], axis=1, keepdims=True)
     return np.where(height > 0.0, -normal, normal)

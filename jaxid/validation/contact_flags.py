@@ -24,11 +24,16 @@ from jaxid.measurement.floating_base import (
     all_standing,
     base_of,
     contact_grid,
-    feet_normal,
-    measured_vertical,
+    measured_gravity,
+)
+from jaxid.measurement.imu_offset import (
+    STANDARD_GRAVITY,
+    ImuOffset,
+    identify_imu_offset,
 )
 from jaxid.measurement.observations import observe
 from jaxid.measurement.recording import Recording
+from jaxid.result_table import significant
 from jaxid.robot.contacts import legs_of
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot
@@ -51,12 +56,13 @@ class ContactLimits(NamedTuple):
     duration: float = 0.2  # shortest stretch that is judged [s]
     gravity: float = 0.05  # deviation of the mean acceleration, relative
     mass: float = 0.02  # effect of a mass at a lifted foot, over that in the trunk
-    tilt: float = 15.0  # between the vertical and the normal of the feet's plane [deg]
+    # rotation [rad], displacement [m] and biases of an IMU [rad/s, m/s²] that are usual
+    imu: tuple[float, ...] = (np.deg2rad(1.0), 0.03, 0.02, 0.05)
+    # what no IMU can have: unexplained [rad/s, m/s²], displacement [m] and biases
+    imu_errors: tuple[float, ...] = (0.2, 1.0, 1.0, 0.5, 2.0)
 
 
 LIMITS = ContactLimits()
-STANDARD_GRAVITY = 9.81
-"""Acceleration of gravity [m/s²]."""
 
 
 class CheckedContacts(NamedTuple):
@@ -80,7 +86,10 @@ def check_contacts(
         InputError: If the recording lacks signals of the base.
     """
     robot = base.model.robot
-    findings = [*imu_findings(robot, recording), *_constant_flags(robot, recording)]
+    findings = [
+        *imu_findings(robot, recording, filter),
+        *_constant_flags(robot, recording),
+    ]
     loads = _loads(base, all_standing(recording, robot), recording, filter)
     doubtful = {place: load for place, load in loads.items() if load > LIMITS.load}
     if doubtful:
@@ -238,10 +247,12 @@ def _is_gravity(acceleration: float) -> bool:
     return abs(acceleration / STANDARD_GRAVITY - 1.0) <= LIMITS.gravity
 
 
-def imu_findings(robot: Robot, recording: Recording) -> list[str]:
-    """Return findings on the IMU: its unit, and its frame by gravity."""
+def imu_findings(
+    robot: Robot, recording: Recording, filter: AbstractFilter
+) -> list[str]:
+    """Return findings on the IMU: its unit, and its frame by gravity or the legs."""
     signals = base_of(recording, robot)
-    up, gravity = measured_vertical(recording, robot)
+    gravity = measured_gravity(recording, robot)
     size = float(np.mean(np.linalg.norm(np.asarray(signals.accelerations), axis=1)))
     if not _is_gravity(gravity):
         # The vertical is unknown then.
@@ -255,15 +266,35 @@ def imu_findings(robot: Robot, recording: Recording) -> list[str]:
             f"{STANDARD_GRAVITY} m/s²: check `accelerometer_unit`, and that gravity is "
             "not subtracted."
         ]
-    findings = []
-    normal = feet_normal(recording, robot)
-    if normal is not None:
-        cosine = np.median(np.sum(normal * up[signals.stands.all(axis=1)], axis=1))
-        tilt = np.rad2deg(np.arccos(np.clip(cosine, -1.0, 1.0)))
-        if tilt > LIMITS.tilt:
-            findings.append(
-                f"gravity as the accelerometer measures it is tilted by {tilt:.0f} "
-                "degrees against the plane of the feet while all stand: the IMU has "
-                "another frame (`robot.imu`), or the ground is steep."
-            )
-    return findings
+    offset = identify_imu_offset(recording, robot, filter)
+    return [] if offset is None else _offset_findings(offset)
+
+
+def _offset_findings(offset: ImuOffset) -> list[str]:
+    """Return that the IMU is not as it is described, as the legs tell it."""
+    sizes = np.linalg.norm(offset.values, axis=1)
+    if (np.append(offset.errors, sizes[1:]) > LIMITS.imu_errors).any():
+        return [
+            "gyroscope and accelerometer do not follow the motion that the legs tell "
+            "while all feet stand: check signs and order of the columns `gyro` and "
+            "`accelerometer`, and `recording.contact`."
+        ]
+    widths = np.linalg.norm(offset.half_widths, axis=1)
+    angle, distance, rate, acceleration = sizes
+    slope = np.rad2deg(acceleration / STANDARD_GRAVITY)
+    words = (
+        f"is turned by {significant(np.rad2deg(angle), 2)} degrees",
+        f"is displaced by {significant(1e3 * distance, 2)} mm",
+        f"has a gyroscope with a bias of {significant(rate, 2)} rad/s",
+        f"has an accelerometer with a bias of {significant(acceleration, 2)} m/s² (or "
+        f"the ground slopes by {slope:.1f} degrees)",
+    )
+    is_large = sizes - widths > LIMITS.imu
+    faults = [text for text, is_fault in zip(words, is_large, strict=True) if is_fault]
+    if not faults:
+        return []
+    return [
+        f"the IMU {', and '.join(faults)} against its description, as the legs tell "
+        "while all feet stand: give `imu_offset = true` in `[recording]`, which "
+        "estimates and removes it, or describe the IMU (`robot.imu`)."
+    ]

@@ -215,7 +215,8 @@ class _BaseWrench(NamedTuple):
         deviations = wrench - wrench.mean(axis=0)
         # Forces and moments count alike, whichever are larger.
         sizes = np.sqrt(np.mean(deviations**2, axis=(0, 2)))
-        weights = np.repeat(1.0 / np.maximum(sizes, 1e-300), 3)
+        scales = np.maximum(sizes, 1e-300)
+        weights = np.repeat(1.0 / scales, 3)
         weighted_columns = columns * weights[:, None]
         A = weighted_columns.reshape(-1, columns.shape[2])
         # Entry (i, j) of the turn brings axis j of the sensor to axis i.
@@ -225,10 +226,13 @@ class _BaseWrench(NamedTuple):
         tool = (known * weights).ravel()
 
         U, s, _ = np.linalg.svd(A, full_matrices=False)
-        U = U[:, s > BASE_LIMITS.rank * s[0]]
+        is_independent = s > BASE_LIMITS.rank * s[0]
+        U = U[:, is_independent]
         sides = np.column_stack([entries, -tool])
-        R = np.linalg.qr(sides - U @ (U.T @ sides), mode="r")
-        return cls(A, tool, entries, np.asarray(R), np.sqrt(deviations.size))
+        remainders = sides - U @ (U.T @ sides)
+        R = np.linalg.qr(remainders, mode="r")
+        size = np.sqrt(deviations.size)
+        return cls(A, tool, entries, np.asarray(R), size)
 
     def best_turn(self, start: Matrix3) -> tuple[Matrix3, float]:
         """Return the best turn near another one, and the share that is unexplained."""

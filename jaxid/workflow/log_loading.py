@@ -14,6 +14,7 @@ from jaxid.errors import InputError
 from jaxid.identification.filter_selection import choose_filter
 from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
+from jaxid.measurement.imu_offset import without_imu_offset
 from jaxid.measurement.log_files import estimated_rows
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.reading import read_excerpt, read_recording, scan_log
@@ -71,6 +72,8 @@ def read_log(setup: Setup, log: FilePath, columns: Columns) -> Recording:
     require_plausible(recording, path, setup.robot)
     if reading.force_delay:
         recording = remove_delay(recording, reading.force_delay)
+    if reading.imu_offset:
+        recording = without_imu_offset(recording, setup.robot, setup.filter)
     return recording
 
 

@@ -107,6 +107,8 @@ class LogReading:
         bad_rows: Share of the rows that may be bad, and are left out.
         start: Start of the part of every log that is used [s], like `0.0`.
         stop: End of that part [s], like `10.0`.
+        imu_offset: Whether rotation, place and biases of the IMU of a floating base are
+            estimated, by the legs while all feet stand on level ground.
     """
 
     forces_file: str | None = None
@@ -116,6 +118,7 @@ class LogReading:
     bad_rows: float = MAX_BAD_ROWS
     start: float = -np.inf
     stop: float = np.inf
+    imu_offset: bool = False
 
     def forces_path(self, log: Path) -> Path | None:
         """Return the path of the file with the forces of a log, if it has one."""
