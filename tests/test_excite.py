@@ -354,7 +354,7 @@ def test_an_impossible_link_leaves_the_check_of_forces(tmp_path, run):
     experiment = load_experiment(tmp_path / "arm.toml")
     assert nominal_of(experiment) is None
     fault = limit_forces(experiment.setup, experiment.excitation, None).fault
-    assert "link `l1`: its `mass` is -1 kg" in fault
+    assert "links `l1`, `l2`, `l3`: `mass` is -1 kg" in fault
 
 
 def test_what_was_not_checked_is_said_first_and_ends_in_a_code(tmp_path, run):

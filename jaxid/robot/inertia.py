@@ -148,20 +148,20 @@ class Inertia(eqx.Module):
         centre = np.asarray(self.centre)
         tensor = np.asarray(self.tensor)
         if not all(np.isfinite(part).all() for part in (mass, centre, tensor)):
-            return "its `mass`, `centre_of_mass` or `inertia` is not finite"
+            return "`mass`, `centre_of_mass` or `inertia` is not finite"
         if not 0.0 <= mass <= MAX_MASS:
-            return f"its `mass` is {mass:g} kg, but must be from 0 to {MAX_MASS:g} kg"
+            return f"`mass` is {mass:g} kg, but must be from 0 to {MAX_MASS:g} kg"
         distance = np.abs(centre).max()
         if distance > MAX_DISTANCE:
-            return f"its `centre_of_mass` is {distance:g} m away: is it in millimetres?"
+            return f"`centre_of_mass` is {distance:g} m away: is it in millimetres?"
         moment = np.abs(tensor).max()
         if moment > DOUBTFUL_LENGTH**2 * max(mass, 1.0):
             return (
-                f"its `inertia` is {moment:g} kg m² "
+                f"`inertia` is {moment:g} kg m² "
                 f"at a mass of {mass:g} kg: is it in kg mm²?"
             )
         if np.abs(tensor - tensor.T).max() > rounding * moment:
-            return "its `inertia` is not symmetric"
+            return "`inertia` is not symmetric"
         low, middle, high = np.linalg.eigvalsh(tensor)
         # Files round away a millimetre's worth of a point mass.
         slack = rounding * max(abs(low), abs(high)) + 1e-4 * rounding * mass

@@ -478,7 +478,7 @@ class UrdfTree(UrdfElements):
             inertia = inertia.nearest_possible()
         fault = inertia.fault(rounding=0.01)
         if are_degrees(rpy):
-            fault = f"its `rpy` is {_words(rpy)}, which are degrees, not radians"
+            fault = f"`rpy` is {_words(rpy)}, which are degrees, not radians"
         R = self.attitude(origin)
         return Inertia(mass, centre, R @ inertia.tensor @ R.T), fault
 
