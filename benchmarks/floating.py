@@ -124,9 +124,9 @@ def mjcf(robot: Legged, model: pin.Model) -> str:
         f'frictionloss="{robot.friction}"'
     )
     feet = {}
-    for number, foot in enumerate(robot.feet):
-        frame = model.frames[model.getFrameId(foot)]
-        feet[frame.parentJoint] = number, frame.placement.translation
+    for number, contact in enumerate(robot.load().contacts):
+        frame = model.frames[model.getFrameId(contact.name)]
+        feet[frame.parentJoint] = number, np.array(contact.position)
 
     def text(values) -> str:
         return " ".join(map(str, np.ravel(values)))

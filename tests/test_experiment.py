@@ -804,3 +804,13 @@ def test_a_cutoff_is_chosen_unless_it_is_given(load):
     assert jid.Setup(setup.model, filter=setup.filter).filter_candidates == ()
     assert dataclasses.replace(setup, load_friction=True).filter_candidates
     assert load(ARM + "[filter]\nkind = 'paper'\n").setup.filter_candidates == ()
+
+
+def test_signals_of_a_trunk_need_a_floating_base(tmp_path):
+    path = tmp_path / "arm.toml"
+    path.write_text(
+        '[robot]\nbuiltin = "planar_arm"\n[recording]\nsample_time = 0.01\n'
+        'angles = "q{}"\nforces = "tau{}"\ngyro = "gyro{}"\n'
+    )
+    with pytest.raises(InputError, match=r"`recording.gyro` .* `floating = true`"):
+        load_experiment(path)

@@ -97,9 +97,14 @@ def show_omissions(
         dynamics.omissions if holds_rotors else (*dynamics.rotors, *dynamics.omissions)
     )
     if names:
+        # C code is for fixed bases only.
+        is_floating = fit.base.model.robot.floating
+        complete_files = "`--to json` keeps"
+        if not is_floating:
+            complete_files = "`--to c` and `--to json` keep"
         text = (
             f"`{path}` cannot hold {', '.join(names)}: a simulation with this file "
-            "lacks these effects; `--to c` and `--to json` keep them."
+            f"lacks these effects; {complete_files} them."
         )
         terminal.show_remarks(console, [Remark(text, Status.DOUBTFUL)])
 

@@ -32,6 +32,7 @@ from .robot_tables import (
     known_load,
     replace_drives,
     replace_limits,
+    require_floating_base,
     require_gears,
     require_joint_lists,
 )
@@ -159,6 +160,7 @@ def _build(tables: TomlTable, text: str, path: Path) -> Experiment:
             tables["recording"], joints, path.parent, getattr(sensor, "wrench", None)
         )
         require_gears(joints, columns)
+        require_floating_base(robot, columns)
     load = None
     if "load" in tables:
         load_of_robot = call(known_load, tables["load"], "load")

@@ -244,6 +244,17 @@ def require_gears(robot: Robot, columns: Columns) -> None:
         )
 
 
+def require_floating_base(robot: Robot, columns: Columns) -> None:
+    """Reject signals of a trunk where the robot stands on a fixed base."""
+    keys = ("gyro", "accelerometer", "contact")
+    given_keys = [key for key in keys if getattr(columns, key) is not None]
+    if given_keys and not robot.floating:
+        raise InputError(
+            f"`recording.{given_keys[0]}` is for a robot on legs: add "
+            "`floating = true` to `[robot]`, or leave the key out."
+        )
+
+
 def replace_limits(
     robot: Robot,
     *,

@@ -47,6 +47,11 @@ def base_of(recording: Recording, robot: Robot) -> BaseSignals:
             f"`{recording.name}` has no forces, which a floating base needs: name "
             "their columns (`forces`)."
         )
+    if signals.contacts.size and not robot.contacts:
+        raise InputError(
+            f"`{robot.name}` has no contacts with the ground: name the links of its "
+            "feet (`robot.contacts`)."
+        )
     if signals.contacts.shape[1] != len(robot.contacts):
         names = ", ".join(contact.name for contact in robot.contacts)
         raise InputError(

@@ -136,8 +136,18 @@ def legs_of(robot: Any) -> Legs:
 def contact_at(tree: Any, link: str, shape: AbstractContactShape) -> Contact:
     """Return the contact of a link of a `UrdfTree` with the ground."""
     tree.require_link("contacts", link)
-    body, _, position = tree.carriers[link]
+    body, rotation, position = tree.carriers[link]
+    if isinstance(shape, Sphere):
+        position = position + rotation @ _ball_centre(tree, link)
     return Contact(link, body, tuple(position.tolist()), shape)
+
+
+def _ball_centre(tree: Any, link: str) -> np.ndarray:
+    """Return the centre of the link's only collision sphere, or its origin [m]."""
+    parts = tree.links[link].findall("collision")
+    balls = [part for part in parts if part.find("geometry/sphere") is not None]
+    origin = balls[0].find("origin") if len(balls) == 1 else None
+    return tree.numbers(origin, "xyz", (0.0, 0.0, 0.0))
 
 
 def imu_at(tree: Any, link: str | Imu | None) -> Imu:

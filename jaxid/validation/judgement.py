@@ -13,6 +13,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.result_table import Remark, Status, percent, significant, sort_remarks
 from jaxid.robot.collision_geometry import BodyShape
 from jaxid.robot.contacts import legs_of
+from jaxid.robot.robot import Robot
 
 from .contact_flags import standing_feet_findings
 from .torque_errors import (
@@ -185,7 +186,7 @@ def judge(report: Report) -> Judgement:
         *_judge_offsets(fit),
         *(Remark(text, Status.DOUBTFUL) for text in standing_feet_findings(fit)),
         *_judge_legs(fit),
-        *_judge_claims(report.claimed_loads, report.fit.base.model.robot.joint_names),
+        *_judge_claims(report.claimed_loads, report.fit.base.model.robot),
         *_judge_friction(fit, report.identification),
         *_remarks_on_fit(report),
         *(Remark(note) for note in report.every_note if note not in bound_notes),
@@ -397,7 +398,7 @@ def _leg_comparisons(fit: Fit, legs: Sequence[Sequence[int]]) -> list[LegCompari
 
 
 def _judge_claims(
-    claimed_loads: Sequence[TorqueErrors], names: Sequence[str]
+    claimed_loads: Sequence[TorqueErrors], robot: Robot
 ) -> Iterator[Remark]:
     """Compare the size of the forces with those of the bodies of the robot's file.
 
@@ -421,10 +422,13 @@ def _judge_claims(
             yield Remark(f"{text}: {cause}", Status.DOUBTFUL)
             continue
         is_small = (sizes > 0) & (claims > MAX_CLAIM_RATIO * sizes)
+        # Forces on a trunk are not logged: they follow from those of the legs.
+        is_small[[*robot.virtual]] = False
         for j in map(int, np.flatnonzero(is_small)):
             forces = f"{significant(claims[j] / sizes[j], 2)} times its logged force"
-            text = f"With the bodies in the robot's file, joint `{names[j]}` would need"
-            yield Remark(f"{text} {forces}: {cause}", Status.DOUBTFUL)
+            joint = f"joint `{robot.joint_names[j]}`"
+            text = f"With the bodies in the robot's file, {joint} would need {forces}"
+            yield Remark(f"{text}: {cause}", Status.DOUBTFUL)
 
 
 def _judge_friction(fit: Fit, logs: Sequence[TorqueErrors]) -> Iterator[Remark]:

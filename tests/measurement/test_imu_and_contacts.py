@@ -39,6 +39,22 @@ def robot(tmp_path_factory):
     return jid.load_urdf(path, floating=True, contacts=feet), path
 
 
+def test_a_ball_is_where_the_file_has_its_sphere(robot):
+    path = robot[1].with_name("balls.urdf")
+    ball = """<collision><origin xyz="0.01 0 0.02"/><geometry><sphere radius="0.03"/>
+        </geometry></collision>"""
+    text = robot[1].read_text()
+    one_ball = f'<link name="lfoot">{ball}</link>'
+    two_balls = f'<link name="rfoot">{ball}{ball}</link>'
+    text = text.replace('<link name="lfoot"/>', one_ball)
+    path.write_text(text.replace('<link name="rfoot"/>', two_balls))
+    feet = {"lfoot": jid.Sphere(RADIUS), "rfoot": jid.Sphere(RADIUS)}
+    left, right = jid.load_urdf(path, floating=True, contacts=feet).contacts
+    np.testing.assert_allclose(left.position, [0.01, 0.0, -0.18], atol=1e-15)
+    # Of two spheres none is known to be the foot.
+    np.testing.assert_allclose(right.position, [0.0, 0.0, -0.2], atol=1e-15)
+
+
 def truth_of(robot, path):
     return np.array(jid.robots.urdf_parameters(path, floating=True))
 
