@@ -91,9 +91,10 @@ def describe_standing(robot: Robot, motion: MotionOnFeet) -> Iterator[Remark]:
         f"feet in the air: {lifts}; columns `contact_…` of the table are 0 then"
     )
     yield Remark(
-        "standing on the feet: not checked are ground that is not level, and "
-        "controllers that are not stiff, so that legs give way under the weight: "
-        "secure the robot against a fall",
+        "standing on the feet: not checked are ground that is not level, and legs that "
+        "give way under the weight: give controllers gains of 20 rad⁻¹ times the "
+        "largest torque, or a larger `support_margin`, and secure the robot against a "
+        "fall",
         Status.DOUBTFUL,
     )
 
