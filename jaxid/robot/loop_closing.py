@@ -108,6 +108,10 @@ class Closure(eqx.Module):
             values = self._in_jax(rows)
         return values.reshape(*q.shape[:-1], -1)
 
+    def next_on_way(self, q: np.ndarray, values: AnyArray) -> AnyArray:
+        """Close the loops of rows, from values of rows near them."""
+        return self._attempted(0, q, values)
+
     def _in_numpy(self, q: np.ndarray) -> np.ndarray:
         """Close the loops of rows, in each attempt those that are still open."""
         values = in_numpy(self, self.at_once, q)
@@ -239,16 +243,24 @@ def reachable(robot: Any, q: np.ndarray) -> np.ndarray:
     """
     if not robot.loops:
         return q
+    closure = Closure(robot)
     start = np.asarray(robot.loop_pose)[: robot.joints]
-    way = np.asarray(q, np.float64) - start
-    shares = np.zeros(way.shape[:-1])
+    way = (np.asarray(q, np.float64) - start).reshape(-1, robot.joints)
+    shares = np.zeros(len(way))
+    is_reached = np.ones(len(way), bool)
+    values = closure.of_samples(np.broadcast_to(start, way.shape))
     for part in range(1, PARTS_OF_RANDOM_WAY + 1):
         share = part / PARTS_OF_RANDOM_WAY
-        values = Closure(robot).of_samples(start + share * way)
-        is_safe = is_closed(values, MIN_SAFE_SHARE)
-        is_reached = shares == (part - 1) / PARTS_OF_RANDOM_WAY
-        shares[is_safe & is_reached] = share
-    return start + shares[..., None] * way
+        points = start + share * way[is_reached]
+        values = closure.next_on_way(points, values)
+        are_safe = is_closed(values, MIN_SAFE_SHARE)
+        values = values[are_safe]
+        is_reached[is_reached] = are_safe
+        shares[is_reached] = share
+    # Robots close their loops on the shortest way, which may be another one.
+    points = start + shares[:, None] * way
+    are_safe = is_closed(closure.of_samples(points), MIN_SAFE_SHARE)
+    return np.where(are_safe[:, None], points, start).reshape(np.shape(q))
 
 
 def _open_error(robot: Any, sample: int, pose: np.ndarray, distance: float):

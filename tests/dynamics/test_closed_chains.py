@@ -11,6 +11,7 @@ from jaxid.errors import InputError
 from jaxid.export.mujoco_model import mjcf_text
 from jaxid.report.parameter_words import in_words
 from jaxid.robot.loop_assembly import with_loops
+from jaxid.robot.loop_closing import reachable
 from jaxid.robot.urdf import urdf_parameters
 
 SAMPLES = 6
@@ -93,6 +94,18 @@ def test_friction_of_passive_joints_acts_by_the_ratios_of_mujoco(mechanism, path
     assert (term.lower_bounds(robot) == 0.0).all()
     places = [in_words(name, model)[1] for name in model.parameter_names]
     assert places == 2 * [f"joint {robot.body_names[body]}" for body in passive]
+
+
+def test_random_coordinates_are_moved_to_where_loops_close(mechanism, path):
+    robot = jid.load_mjcf(path)
+    start = np.asarray(robot.loop_pose)[: robot.joints]
+    q = start + np.random.default_rng(3).uniform(-6.0, 6.0, (2, 100, robot.joints))
+    safe = reachable(robot, q)
+    assert safe.shape == q.shape
+    # `close` refuses samples that stay open.
+    robot.close(safe)
+    assert (np.abs(safe - start) <= np.abs(q - start) + 1e-12).all()
+    assert (np.ptp(safe, axis=(0, 1)) > 0.2).all()
 
 
 def test_an_arm_has_no_passive_joints():
@@ -323,6 +336,10 @@ def test_designs_keep_away_from_singular_poses_and_limits_of_passive_joints(path
     slide = robot.close(q[:2])[:, -1]
     lower = names.index("joint `slide`, which loops move,")
     np.testing.assert_allclose(values[:2, lower], (-0.2 - slide) / 0.3, atol=1e-9)
+    motion = jid.Motion(q[:2], 0 * q[:2], 0 * q[:2])
+    _, slopes = limits.linearisation(robot)(motion, np.full(2, lower))
+    slide_change = robot.close(q[:2] + 1e-6) - robot.close(q[:2] - 1e-6)
+    np.testing.assert_allclose(slopes[0][:, 0], -slide_change[:, -1] / 0.6e-6, 1e-6)
     problem = jid.ExcitationProblem(
         jid.base_parameters(jid.Model(robot, (jid.RigidBodies(),))), noise=[1.0]
     )
