@@ -24,6 +24,7 @@ from .filters import AbstractFilter
 from .floating_base import base_of, contact_grid, plane_normal
 from .recording import Recording
 from .samples import joint_side
+from .sensor_turns import TurnedVectors
 
 STANDARD_GRAVITY = 9.81
 """Acceleration of gravity [m/s²]."""
@@ -36,8 +37,7 @@ class ImuSettings(NamedTuple):
     min_time: float = 2.0  # time in which all feet stand [s]
     block_time: float = 0.5  # errors of different blocks are independent [s]
     student: float = 2.2  # 95 % interval over the deviation, of some ten blocks
-    steps: int = 8  # of Gauss and Newton, from each start
-    tie: float = 1.5  # ratio of costs of equally good attitudes
+    tie: float = 1.22  # ratio of the errors of equally good attitudes
     place: float = 0.1  # standard deviation of the place before the log [m]
     noise: tuple[float, float] = (0.02, 0.2)  # errors at first [rad/s, m/s²]
 
@@ -101,23 +101,72 @@ class ImuOffset(NamedTuple):
         return dataclasses.replace(recording, base=signals, notes=notes)
 
 
-class _Stance(NamedTuple):
-    """Motion of the base as legs and IMU tell it, while all feet stand.
+PRIOR = np.repeat([1.0 / SETTINGS.place, 0.0, 0.0], 3)
+"""Inverse of the standard deviations of place and biases before the log."""
+
+
+class _ImuRows(NamedTuple):
+    """What an IMU measures while all feet stand, and what the legs tell of it.
+
+    Each row is an angular velocity and an acceleration less gravity [rad/s, m/s²].
 
     Attributes:
-        rates: Angular velocity of the base [rad/s].
-        angular_accelerations: Its derivative [rad/s²].
-        accelerations: Acceleration at the described place of the IMU, less gravity
-            [m/s²].
-        measured: What gyroscope and accelerometer measure, with their biases.
+        measured: Measured rows, with their biases.
+        known: Rows of an IMU as it is described, as the legs tell them.
+        columns: Columns of its displacement in the base, and of the two biases along
+            the described axes.
         blocks: Number of the block of time of each row.
     """
 
-    rates: AnyArray
-    angular_accelerations: AnyArray
-    accelerations: AnyArray
-    measured: AnyArray
+    measured: Float[np.ndarray, "rows 2 3"]
+    known: Float[np.ndarray, "rows 2 3"]
+    columns: Float[np.ndarray, "rows 2 3 9"]
     blocks: AnyArray
+
+    def vectors(self, noise: np.ndarray) -> TurnedVectors:
+        """Return the rows with the standard deviations of their errors."""
+        return TurnedVectors.of(self.measured, self.known, self.columns, noise, PRIOR)
+
+    def errors(self, turn: Matrix3, unknowns: np.ndarray) -> np.ndarray:
+        """Return what is unexplained of turned rows."""
+        return self.measured @ turn.T - self.known - self.columns @ unknowns
+
+    def sizes(self, turn: Matrix3, unknowns: np.ndarray) -> np.ndarray:
+        """Return the RMS of the errors of angular velocities and accelerations."""
+        return np.sqrt(np.mean(self.errors(turn, unknowns) ** 2, axis=(0, 2)))
+
+    def slopes(self, unknowns: np.ndarray) -> Float[np.ndarray, "rows 2 3 12"]:
+        """Return the columns of a small turn, and of the unknowns."""
+        displacement = self.columns[..., :3] @ unknowns[:3]
+        motion = self.known + displacement
+        turn_columns = [np.cross(motion, axis)[..., None] for axis in np.eye(3)]
+        return np.concatenate([*turn_columns, self.columns], axis=3)
+
+    def half_widths(
+        self, turn: Matrix3, unknowns: np.ndarray, noise: np.ndarray
+    ) -> Float[np.ndarray, "4 3"]:
+        """Return half of the 95 % intervals of the estimates.
+
+        Errors in blocks of time tell how uncertain the unknowns are.
+        """
+        slopes = self.slopes(unknowns) / noise[:, None, None]
+        errors = self.errors(turn, unknowns) / noise[:, None]
+        gradients = np.einsum("nbai,nba->ni", slopes, errors)
+        sums = np.zeros((self.blocks.max() + 1, 12))
+        np.add.at(sums, self.blocks, gradients)
+
+        prior = np.zeros((12, 12))
+        prior[3:, 3:] = np.diag(PRIOR**2)
+        products = np.einsum("nbai,nbaj->ij", slopes, slopes)
+        information = products + prior
+        inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
+        variation = sums.T @ sums + prior
+        covariance = inverse @ variation @ inverse
+        # All estimates but the place are along the axes of the IMU.
+        axes = scipy.linalg.block_diag(turn, np.eye(3), turn, turn)
+        variances = np.diag(axes.T @ covariance @ axes)
+        half_widths = SETTINGS.student * np.sqrt(variances)
+        return half_widths.reshape(4, 3)
 
 
 def without_imu_offset(
@@ -145,84 +194,27 @@ def identify_imu_offset(
 
     They tell it while all feet stand on level ground, three at least.
     """
-    stance = _stance(recording, robot, filter)
-    if stance is None:
+    rows = _imu_rows(recording, robot, filter)
+    if rows is None:
         return None
-    described = rpy_rotation(robot.imu.rpy)
-    quarter_turns = scipy.spatial.transform.Rotation.create_group("O").as_matrix()
     noise = np.array(SETTINGS.noise)
-    fits = [_fit(stance, described @ turn, noise) for turn in quarter_turns]
-    costs = [np.sum((fit.errors / noise) ** 2) for fit in fits]
-    equals = [
-        fit
-        for fit, cost in zip(fits, costs, strict=True)
-        if cost <= SETTINGS.tie * min(costs)
-    ]
-    # The trace of a turn falls with its angle.
-    best = max(equals, key=lambda fit: np.trace(described.T @ fit.attitude))
-    best = _fit(stance, best.attitude, best.errors)
-    turn = scipy.spatial.transform.Rotation.from_matrix(described.T @ best.attitude)
-    values = np.vstack([turn.as_rotvec(), best.values[1:]])
-    return best._replace(values=values)
+    vectors = rows.vectors(noise)
+    turn = vectors.least_turn(SETTINGS.tie)
+    # The final estimate uses the errors that are found.
+    noise = rows.sizes(turn, vectors.unknowns(turn))
+    vectors = rows.vectors(noise)
+    turn = vectors.turn_near(turn)
 
-
-def _fit(stance: _Stance, attitude: Matrix3, noise: np.ndarray) -> ImuOffset:
-    """Fit all unknowns to what the IMU measures, from an attitude on.
-
-    The rotation among the values of the result is the last step, which is nothing.
-    """
-    prior = np.zeros((12, 12))
-    prior[3:6, 3:6] = np.eye(3) / SETTINGS.place**2
-    unknowns = np.zeros(12)
-    scale = np.repeat(noise, 3)
-    errors, slopes = _errors(stance, attitude, unknowns, scale)
-    for _ in range(SETTINGS.steps):
-        information = np.einsum("nki,nkj->ij", slopes, slopes)
-        gradient = np.einsum("nki,nk->i", slopes, errors) - prior @ unknowns
-        # An attitude of which nothing is known stays as it is.
-        step = np.linalg.lstsq(information + prior, gradient, rcond=1e-12)[0]
-        turn = scipy.spatial.transform.Rotation.from_rotvec(step[:3])
-        attitude = attitude @ turn.as_matrix()
-        unknowns = unknowns + step * (np.arange(12) > 2)
-        errors, slopes = _errors(stance, attitude, unknowns, scale)
-    information = np.einsum("nki,nkj->ij", slopes, slopes)
-    # Errors in blocks of time tell how uncertain the unknowns are.
-    sums = np.zeros((stance.blocks.max() + 1, 12))
-    np.add.at(sums, stance.blocks, np.einsum("nki,nk->ni", slopes, errors))
-    inverse = np.linalg.pinv(information + prior, rcond=1e-12, hermitian=True)
-    covariance = inverse @ (sums.T @ sums + prior) @ inverse
-    half_widths = SETTINGS.student * np.sqrt(np.diag(covariance))
-    sizes = np.sqrt(np.mean(errors.reshape(-1, 2, 3) ** 2, axis=(0, 2)))
+    unknowns = vectors.unknowns(turn)
+    angles = scipy.spatial.transform.Rotation.from_matrix(turn).as_rotvec()
+    values = np.append(angles, unknowns).reshape(4, 3)
+    values[2:] = values[2:] @ turn
     return ImuOffset(
-        attitude, unknowns.reshape(4, 3), half_widths.reshape(4, 3), sizes * noise
+        attitude=rpy_rotation(robot.imu.rpy) @ turn,
+        values=values,
+        half_widths=rows.half_widths(turn, unknowns, noise),
+        errors=rows.sizes(turn, unknowns),
     )
-
-
-def _errors(
-    stance: _Stance, attitude: Matrix3, unknowns: np.ndarray, scale: np.ndarray
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return what is unexplained of the IMU [rows 6], and the slopes [rows 6 12].
-
-    The slopes are those of what is explained; both are relative to a scale.
-    """
-    arm = unknowns[3:6]
-    biases = unknowns[6:]
-    motion = (stance.rates, stance.angular_accelerations)
-    rates = stance.rates @ attitude
-    accelerations = stance.accelerations + _acceleration_at(arm, *motion)
-    accelerations = accelerations @ attitude
-    slopes = np.zeros((len(rates), 6, 12))
-    for axis, unit in enumerate(np.eye(3)):
-        slopes[:, :3, axis] = np.cross(rates, unit)
-        slopes[:, 3:, axis] = np.cross(accelerations, unit)
-        acceleration = _acceleration_at(unit, *motion)
-        slopes[:, 3:, 3 + axis] = acceleration @ attitude
-    slopes[:, :, 6:] = np.eye(6)
-
-    predicted = np.hstack([rates, accelerations])
-    predicted = predicted + biases
-    errors = np.asarray(stance.measured) - predicted
-    return errors / scale, slopes / scale[:, None]
 
 
 def _acceleration_at(arm: Vector3, rates: AnyArray, changes: AnyArray) -> np.ndarray:
@@ -230,19 +222,20 @@ def _acceleration_at(arm: Vector3, rates: AnyArray, changes: AnyArray) -> np.nda
     return np.cross(changes, arm) + np.cross(rates, np.cross(rates, arm))
 
 
-def _stance(
+def _imu_rows(
     recording: Recording, robot: Robot, filter: AbstractFilter
-) -> _Stance | None:
-    """Return the motion while all feet stand; None if that is too short."""
+) -> _ImuRows | None:
+    """Return the rows while all feet stand; None if that is too short."""
     if len(robot.contacts) < 3:
         return None
     signals = base_of(recording, robot)
     forces = np.asarray(recording.forces)
     q, _, _ = joint_side(robot, recording, recording.angles, None, forces)
+    measured = np.hstack([signals.rates, signals.accelerations])
     sample_time = recording.sample_time
     edge = filter.edge(sample_time)
     step = max(1, int(SETTINGS.max_step / sample_time))
-    measured = np.hstack([signals.rates, signals.accelerations])
+    row_time = step * sample_time
     parts = []
     for a, b in contact_grid(recording, robot).segments:
         rows = slice(edge, b - a - edge, step)
@@ -251,23 +244,45 @@ def _stance(
             continue
         joints = filter.motion(q[a:b], None, sample_time)[rows]
         smooth = filter.motion(measured[a:b], None, sample_time).q[rows]
-        motion = _base_motion(robot, joints, step * sample_time)
-        parts.append((*motion, smooth, np.arange(len(smooth)) * step * sample_time))
-    if not parts:
+        known, columns = _motion_of_legs(robot, joints, row_time)
+        numbers = np.arange(len(smooth)) * row_time // SETTINGS.block_time
+        parts.append((smooth.reshape(-1, 2, 3), known, columns, numbers))
+    if sum(len(part[0]) for part in parts) * row_time < SETTINGS.min_time:
         return None
-    rates, turning, accelerations, smooth, times = map(
-        np.concatenate, zip(*parts, strict=True)
-    )
-    if len(times) * step * sample_time < SETTINGS.min_time:
-        return None
-    blocks = np.cumsum(np.diff(times // SETTINGS.block_time, prepend=0.0) != 0)
-    return _Stance(rates, turning, accelerations, smooth, blocks)
+    measured, known, columns, numbers = map(np.concatenate, zip(*parts, strict=True))
+    blocks = np.cumsum(np.diff(numbers, prepend=0.0) != 0)
+    return _ImuRows(measured, known, columns, blocks)
 
 
-def _base_motion(
+def _motion_of_legs(
     robot: Robot, joints: Motion, row_time: float
-) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the first three fields of `_Stance`; the contacts do not move."""
+) -> tuple[np.ndarray, np.ndarray]:
+    """Return `known` and `columns` of rows that are one after the other."""
+    twist, up = _base_twist(robot, joints)
+    velocity = twist[:, :3]
+    rates = twist[:, 3:]
+    change = np.gradient(twist, row_time, axis=0)
+    turning = change[:, 3:]
+    accelerations = change[:, :3] + np.cross(rates, velocity)
+    accelerations = accelerations + STANDARD_GRAVITY * up
+    place = np.array(robot.imu.position)
+    at_imu = accelerations + _acceleration_at(place, rates, turning)
+
+    axes = rpy_rotation(robot.imu.rpy)
+    known = np.stack([rates, at_imu], axis=1) @ axes
+    columns = np.zeros((*known.shape, 9))
+    for axis, unit in enumerate(np.eye(3)):
+        columns[:, 1, :, axis] = _acceleration_at(unit, rates, turning) @ axes
+    columns[:, 0, :, 3:6] = np.eye(3)
+    columns[:, 1, :, 6:] = np.eye(3)
+    return known, columns
+
+
+def _base_twist(robot: Robot, joints: Motion) -> tuple[np.ndarray, np.ndarray]:
+    """Return velocity and angular velocity of the base, and the vertical.
+
+    All are along the axes of the base; the contacts do not move.
+    """
     angles = np.zeros((len(joints.q), robot.joints))
     angles[:, list(robot.driven)] = joints.q
     order = np.argsort(robot.order)
@@ -284,10 +299,4 @@ def _base_motion(
     by_joints = np.einsum("njf,nj->nf", slopes[:, list(robot.driven)], joints.qd)
     by_base = np.moveaxis(slopes[:, :GROUP], 1, 2)
     twist = -np.einsum("nif,nf->ni", np.linalg.pinv(by_base), by_joints)
-    velocity = twist[:, :3]
-    rates = twist[:, 3:]
-    change = np.gradient(twist, row_time, axis=0)
-    turning = change[:, 3:]
-    accelerations = change[:, :3] + np.cross(rates, velocity) + STANDARD_GRAVITY * up
-    place = np.array(robot.imu.position)
-    return rates, turning, accelerations + _acceleration_at(place, rates, turning)
+    return twist, up

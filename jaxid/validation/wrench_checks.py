@@ -17,9 +17,9 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import SensorLoad
 from jaxid.measurement.force_sensors import sensor_attitudes
 from jaxid.measurement.observations import Observations
+from jaxid.measurement.sensor_turns import TurnedVectors
 from jaxid.result_table import Remark, Status, significant
 from jaxid.robot.robot import Robot
-from jaxid.robot.rotations import skew
 from jaxid.robot.virtual_joints import GROUP
 
 Forces = Float[np.ndarray, "rows 3"]
@@ -179,8 +179,6 @@ class BaseWrenchLimits(NamedTuple):
     """
 
     rows: int = 300  # rows of the log that are looked at
-    rank: float = 1e-6  # least singular value of the columns, over the largest one
-    steps: int = 8  # turns from each start
     tie: float = 1.1  # ratio of what turns leave unexplained that are equally good
     certain: float = 0.5  # remaining part of the unexplained if another way is right
     doubtful: float = 0.98  # remaining part if the sensor may be turned a little
@@ -188,74 +186,6 @@ class BaseWrenchLimits(NamedTuple):
 
 
 BASE_LIMITS = BaseWrenchLimits()
-
-
-class _BaseWrench(NamedTuple):
-    """Wrench of a sensor under the base, and what the bodies of the robot explain.
-
-    Attributes:
-        columns: Weighted columns of the parameters.
-        known: Weighted wrench of the known tool.
-        entries: Weighted wrenches along turned axes, one for each entry of the turn.
-        unexplained: What the columns explain neither of the entries nor of the tool's.
-        size: Norm of the weighted wrench without its mean.
-    """
-
-    columns: np.ndarray
-    known: np.ndarray
-    entries: np.ndarray
-    unexplained: np.ndarray
-    size: float
-
-    @classmethod
-    def of(
-        cls, columns: np.ndarray, known: np.ndarray, wrench: np.ndarray
-    ) -> "_BaseWrench":
-        """Return the wrench [rows 2 3] beside columns [rows 6 parameters]."""
-        deviations = wrench - wrench.mean(axis=0)
-        # Forces and moments count alike, whichever are larger.
-        sizes = np.sqrt(np.mean(deviations**2, axis=(0, 2)))
-        scales = np.maximum(sizes, 1e-300)
-        weights = np.repeat(1.0 / scales, 3)
-        weighted_columns = columns * weights[:, None]
-        A = weighted_columns.reshape(-1, columns.shape[2])
-        # Entry (i, j) of the turn brings axis j of the sensor to axis i.
-        axes = np.einsum("ai,nbj->nbaij", np.eye(3), wrench)
-        weighted_axes = axes.reshape(-1, GROUP, 9) * weights[:, None]
-        entries = weighted_axes.reshape(-1, 9)
-        tool = (known * weights).ravel()
-
-        U, s, _ = np.linalg.svd(A, full_matrices=False)
-        is_independent = s > BASE_LIMITS.rank * s[0]
-        U = U[:, is_independent]
-        sides = np.column_stack([entries, -tool])
-        remainders = sides - U @ (U.T @ sides)
-        R = np.linalg.qr(remainders, mode="r")
-        size = np.sqrt(deviations.size)
-        return cls(A, tool, entries, np.asarray(R), size)
-
-    def best_turn(self, start: Matrix3) -> tuple[Matrix3, float]:
-        """Return the best turn near another one, and the share that is unexplained."""
-        turn = start
-        for _ in range(BASE_LIMITS.steps):
-            changes = np.stack([skew(axis) @ turn for axis in np.eye(3)])
-            slopes = self.unexplained[:, :9] @ changes.reshape(3, 9).T
-            step, *_ = np.linalg.lstsq(slopes, -self.errors(turn), rcond=None)
-            turn = scipy.spatial.transform.Rotation.from_rotvec(step).as_matrix() @ turn
-        return turn, self.share(turn)
-
-    def errors(self, turn: Matrix3) -> np.ndarray:
-        """Return what is unexplained along turned axes."""
-        return self.unexplained @ np.append(turn, 1.0)
-
-    def share(self, turn: Matrix3) -> float:
-        """Return the norm of what is unexplained, over that of the wrench."""
-        return float(np.linalg.norm(self.errors(turn)) / self.size)
-
-    def parameters(self, turn: Matrix3) -> np.ndarray:
-        """Return the parameters that explain the wrench along turned axes best."""
-        side = self.entries @ turn.ravel() - self.known
-        return np.linalg.lstsq(self.columns, side, rcond=BASE_LIMITS.rank)[0]
 
 
 def base_wrench_remarks(model: Model, observations: Observations) -> list[Remark]:
@@ -268,42 +198,42 @@ def base_wrench_remarks(model: Model, observations: Observations) -> list[Remark
     rows = slice(None, None, -(-observations.rows // BASE_LIMITS.rows))
     motion = observations.reduced_motion[rows]
     columns = np.asarray(model.regressor(motion))[:, :GROUP]
-    known = np.asarray(model.tool_forces(motion))[:, :GROUP]
+    columns = columns.reshape(-1, 2, 3, model.size)
+    known = np.asarray(model.tool_forces(motion))[:, :GROUP].reshape(-1, 2, 3)
     measured = observations.reduced_forces[rows, :GROUP].reshape(-1, 2, 3)
-    wrench = _BaseWrench.of(columns, known, measured)
-    exchanged_wrench = _BaseWrench.of(columns, known, measured[:, ::-1])
-    turn, share = _least_turn(wrench)
-    _, share_if_exchanged = _least_turn(exchanged_wrench)
-    if share_if_exchanged < BASE_LIMITS.certain * share:
+    # Forces and moments count alike, whichever are larger.
+    sizes = np.sqrt(np.mean(np.var(measured, axis=0), axis=1))
+    sizes = np.maximum(sizes, 1e-300)
+    wrench = TurnedVectors.of(measured, known, columns, sizes)
+    exchanged = TurnedVectors.of(measured[:, ::-1], known, columns, sizes[::-1])
+    turn = wrench.least_turn(BASE_LIMITS.tie)
+    error_if_exchanged = exchanged.error(exchanged.least_turn(BASE_LIMITS.tie))
+    if error_if_exchanged < BASE_LIMITS.certain * wrench.error(turn):
         text = (
             "forces and moments are exchanged: the bodies of the robot explain the "
             "last three columns of `wrench` as forces. Name the three forces first."
         )
         return [Remark(text, Status.BAD)]
-    remarks = []
-    p = wrench.parameters(turn)
+    remarks = _base_turn_remarks(model.robot, wrench, turn)
+    p = wrench.unknowns(turn)
     M = np.asarray(model.mass_matrix(p, motion.q))[:, GROUP:, GROUP:]
     # Bodies of negative mass explain a wrench of the other sign as well.
     if np.trace(M, axis1=1, axis2=2).mean() < 0.0:
-        remarks.append(Remark(OPPOSITE_SIGN, Status.BAD))
-    gain = share / wrench.share(np.eye(3))
-    if _angle(turn) > BASE_LIMITS.max_angle and gain < BASE_LIMITS.doubtful:
-        described = np.asarray(model.robot.rotation)[0]
-        text = _turn_text(described, turn, "the motion")
-        is_certain = gain < BASE_LIMITS.certain
-        status = Status.BAD if is_certain else Status.DOUBTFUL
-        remarks.append(Remark(text, status))
+        remarks.insert(0, Remark(OPPOSITE_SIGN, Status.BAD))
     return remarks
 
 
-def _least_turn(wrench: _BaseWrench) -> tuple[Matrix3, float]:
-    """Return the smallest of the best turns, and the share that it leaves."""
-    starts = scipy.spatial.transform.Rotation.create_group("O").as_matrix()
-    turns = [wrench.best_turn(start) for start in starts]
-    least = min(share for _, share in turns)
-    equals = [x for x in turns if x[1] <= BASE_LIMITS.tie * least]
-    # The trace of a turn falls with its angle.
-    return max(equals, key=lambda x: np.trace(x[0]))
+def _base_turn_remarks(
+    robot: Robot, wrench: TurnedVectors, turn: Matrix3
+) -> list[Remark]:
+    """Return that a sensor under the base is turned, if that explains more."""
+    unexplained_part = wrench.error(turn) / wrench.error(np.eye(3))
+    is_small = _angle(turn) <= BASE_LIMITS.max_angle
+    if is_small or unexplained_part >= BASE_LIMITS.doubtful:
+        return []
+    text = _turn_text(np.asarray(robot.rotation)[0], turn, "the motion")
+    is_certain = unexplained_part < BASE_LIMITS.certain
+    return [Remark(text, Status.BAD if is_certain else Status.DOUBTFUL)]
 
 
 OPPOSITE_SIGN = (
