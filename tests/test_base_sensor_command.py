@@ -83,6 +83,10 @@ def cell(tmp_path_factory):
     (folder / "arm.xml").write_text(ARM.format(site="", sensor=""))
     (folder / "e.toml").write_text(FILE)
     with_torques = FILE.replace("[filter]", 'forces = "tau{}"\n[filter]')
+    with_torques = with_torques.replace(
+        "[rows]", "[rows]\nmin_speed = [0.02, 0.02, 0.02]"
+    )
+    with_torques += "[model.coulomb]\nepsilon = [0.01, 0.01, 0.02]\n"
     (folder / "f.toml").write_text(with_torques)
     t = np.arange(0.0, 15.0, 0.01)
     clean = simulated(t, 1)
@@ -151,6 +155,21 @@ def test_torques_tell_friction_beside_the_wrench(here, run):  # noqa: F811
     values = {row["name"]: row["estimate"] for row in rows}
     for number, damping in enumerate((0.7, 0.4, 0.2), 1):
         assert abs(values[f"fv{number}"] - damping) < 0.05
+
+
+def test_speeds_in_a_list_are_those_of_the_driven_joints(cell):
+    """A sensor at the end-effector adds virtual joints behind, not before them."""
+    setup = jid.experiment.load_experiment(cell / "f.toml").setup
+    sensor = jid.workflow.ForceSensor(["fx", "fy", "fz", "tx", "ty", "tz"])
+    model = sensor.base(setup, has_forces=True).model
+    qd = np.zeros(9)
+    qd[:3] = 0.01, 0.02, -0.03
+    regressor = np.asarray(model.regressor(jid.Motion(0.3 * qd, qd, 0 * qd)))
+    places = [model.parameter_names.index(f"fc{joint}") for joint in (1, 2, 3)]
+    shares = qd[:3] / [0.01, 0.01, 0.02]
+    np.testing.assert_allclose(
+        regressor[:3, places], np.diag(np.tanh(shares)), rtol=1e-6
+    )
 
 
 def test_a_wrong_frame_is_named(cell):

@@ -145,9 +145,9 @@ class ModelSearch:
             self.text = changed_text(self.text, {"filter": table})
         self._changes: tuple[str, ...] = ()
         logs = self._observe(setup)
-        self._max_speeds = np.max(
-            [np.abs(log.motion.qd).max(axis=0) for log in logs], axis=0
-        )
+        max_speeds = [np.abs(log.motion.qd).max(axis=0) for log in logs]
+        driven = list(setup.robot.driven)
+        self._max_speeds = np.max(max_speeds, axis=0)[driven]
         self._row_changes = self._changes_of_rows(setup)
         cutoff = setup.filter.low_pass(logs[0].sample_time).cutoff
         self.band = f"below {cutoff:.3g} Hz"
@@ -425,4 +425,5 @@ def join_terms(models: Sequence[Model]) -> tuple[AbstractTerm, ...]:
 def _stribeck_speeds(base: BaseParameters) -> list[float]:
     """Return the Stribeck speeds of a model as an experiment file holds them."""
     term = next(x for x in base.model.terms if isinstance(x, StribeckFriction))
-    return [float(f"{speed:.2g}") for speed in np.asarray(term.speed)]
+    speeds = np.asarray(term.speed)
+    return [float(f"{speeds[joint]:.2g}") for joint in base.model.robot.driven]

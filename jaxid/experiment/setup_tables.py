@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float, Texts
+from jaxid.arrays import Float, Texts, Vector
 from jaxid.dynamics import terms
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
@@ -80,7 +80,7 @@ class DryFriction:
             return terms.HardSign()
         if self.epsilon is None:
             return terms.Tanh()
-        return terms.Tanh(_speed(robot, "coulomb.epsilon", self.epsilon))
+        return terms.Tanh(_speed_of_term(robot, "coulomb.epsilon", self.epsilon))
 
     def term(self, robot: Robot) -> terms.AbstractTerm:
         """Return the term of the model."""
@@ -96,26 +96,39 @@ class DryFriction:
             raise InputError(
                 "give `coulomb.stribeck` or `coulomb.asymmetric`, but not both."
             )
-        speed = _speed(robot, "coulomb.stribeck", self.stribeck)
+        speed = _speed_of_term(robot, "coulomb.stribeck", self.stribeck)
         return terms.StribeckFriction(speed=speed, transition=transition)
 
 
-def _speed(
+def _speeds(robot: Robot, name: str, value: float | list[float]) -> Vector:
+    """Return a speed of each driven joint, within what the joints reach."""
+    joints = robot.driven
+    if isinstance(value, list):
+        speeds = per_joint(name, value, len(joints), 0.0)
+    else:
+        speeds = np.full(len(joints), float(value))
+    max_speeds = np.minimum(np.asarray(robot.limits.velocity), MAX_SPEED)
+    for j, speed in zip(joints, speeds, strict=True):
+        if speed > max_speeds[j]:
+            raise InputError(
+                f"`{name}` must be below the largest speed of joint "
+                f"`{robot.joint_names[j]}`, {max_speeds[j]:g} {robot.joint_unit(j)}/s, "
+                f"but is {speed:g}."
+            )
+    return speeds
+
+
+def _speed_of_term(
     robot: Robot, name: str, value: float | list[float]
 ) -> float | Float[np.ndarray, " joints"]:
-    """Return a speed of all joints or of each, within what the joints reach."""
-    if isinstance(value, list):
-        speeds = per_joint(name, value, robot.joints, 0.0)
-    else:
-        speeds = np.full(robot.joints, float(value))
-    max_speeds = np.minimum(np.asarray(robot.limits.velocity), MAX_SPEED)
-    for j, label in enumerate(robot.joint_names):
-        if speeds[j] > max_speeds[j]:
-            raise InputError(
-                f"`{name}` must be below the largest speed of joint `{label}`, "
-                f"{max_speeds[j]:g} {robot.joint_unit(j)}/s, but is {speeds[j]:g}."
-            )
-    return speeds if isinstance(value, list) else float(value)
+    """Return a speed of all joints, or of each of them."""
+    speeds = _speeds(robot, name, value)
+    if not isinstance(value, list):
+        return float(value)
+    # Virtual joints have no friction, whatever their speed is.
+    all_speeds = np.ones(robot.joints)
+    all_speeds[list(robot.driven)] = speeds
+    return all_speeds
 
 
 SWITCHES = {name: term for name, term in terms.TERMS.items() if term.is_switch}
@@ -294,7 +307,7 @@ def build_rows(
     *,
     step: int = 1,
     min_speed: float | list[float] | None = None,
-) -> tuple[filters.Subsample, Float[np.ndarray, " joints"] | None]:
+) -> tuple[filters.Subsample, Vector | None]:
     """Rows of the least-squares problem, and samples that become rows.
 
     Args:
@@ -306,8 +319,7 @@ def build_rows(
     """
     speeds = None
     if min_speed is not None:
-        speed = _speed(robot, "min_speed", min_speed)
-        speeds = np.broadcast_to(speed, (robot.joints,)).copy()
+        speeds = _speeds(robot, "min_speed", min_speed)
     return filters.Subsample(step), speeds
 
 

@@ -29,10 +29,11 @@ def rest_remarks(described_log: DescribedLog) -> tuple[str, ...]:
     if not is_told.any():
         return ()
     worst_joint = int(np.argmax(errors * is_told))
-    joint_names = np.array(described_log.robot.joint_names)
+    robot = described_log.robot
+    joint_names = np.array(robot.joint_names)
     names = ", ".join(f"`{name}`" for name in joint_names[is_told])
     speeds = REST_SPEED * np.abs(described_log.log.motion.qd).max(axis=0)
-    texts = ", ".join(f"{speed:.2g}" for speed in speeds)
+    texts = ", ".join(f"{speeds[joint]:.2g}" for joint in robot.driven)
     return (
         f"the motion does not determine friction at rest: on unseen parts of {names} "
         f"the errors are up to {significant(100 * errors[worst_joint], 2)} % of the "

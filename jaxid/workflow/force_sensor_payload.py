@@ -5,11 +5,17 @@ from collections.abc import Sequence
 from functools import partial
 from pathlib import Path
 
+import jax
 import numpy as np
 
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.terms import SensorBias, SensorLoad, SensorRotation
+from jaxid.dynamics.terms import (
+    AbstractTerm,
+    SensorBias,
+    SensorLoad,
+    SensorRotation,
+)
 from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit
 from jaxid.identification.force_sensor import identify_sensor_rotation
@@ -23,6 +29,7 @@ from jaxid.measurement.observations import Observations, observe
 from jaxid.result_table import Remark, Status
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
+from jaxid.robot.virtual_joints import GROUP
 from jaxid.validation.diagnosis import diagnose
 from jaxid.validation.wrench_checks import wrench_remarks
 
@@ -78,6 +85,18 @@ class ForceSensor:
         rotation = rpy_rotation(np.deg2rad(self.rotation))
         return robot.with_sensor(rotation, self.position, under_base=self.under_base)
 
+    def terms_on(self, setup: Setup) -> tuple[AbstractTerm, ...]:
+        """Return the terms of the robot with the sensor, which adds virtual joints."""
+        joints = setup.robot.joints
+        widths = (GROUP, 0) if self.under_base else (0, GROUP)
+
+        def with_virtual(values):
+            # Virtual joints have no friction, whatever its constants are.
+            is_each = np.shape(values) == (joints,)
+            return np.pad(values, widths, constant_values=1.0) if is_each else values
+
+        return jax.tree.map(with_virtual, setup.model.terms)
+
     def columns(self, columns: Columns) -> Columns:
         """Return the columns of logs, with those of the wrench."""
         return dataclasses.replace(columns, wrench=self.wrench, wrench_sign=self.sign)
@@ -95,7 +114,7 @@ class ForceSensor:
                 "`load` in `[model]` must not be given with a sensor under the base: "
                 "leave it out."
             )
-        terms = setup.model.terms
+        terms = self.terms_on(setup)
         if columns.forces is None:
             terms = tuple(term for term in terms if term.body_parameters)
         model = Model(self.on(setup.robot), (*terms, SensorBias()))
@@ -107,7 +126,7 @@ class ForceSensor:
         Logs without forces of the joints tell of what is behind the sensor only.
         """
         robot = self.on(setup.robot)
-        bodies = setup.model.terms if has_forces else (SensorLoad(),)
+        bodies = self.terms_on(setup) if has_forces else (SensorLoad(),)
         return base_parameters(Model(robot, (*bodies, SensorBias(), SensorRotation())))
 
 

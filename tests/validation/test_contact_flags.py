@@ -312,6 +312,32 @@ def test_no_motion_is_designed_for_a_floating_base(base):
         jid.ExcitationProblem(base)
 
 
+def test_speeds_in_a_list_are_those_of_the_driven_joints(dog):
+    """Joints of the base are none of them, and all rows of the base count."""
+    folder, log = dog
+    speeds = [0.02 * number for number in range(1, 13)]
+    path = folder / "speeds.toml"
+    path.write_text(FILE + f"[model.coulomb]\nepsilon = {speeds}\n")
+    setup = jid.experiment.load_experiment(path).setup
+    recording = jid.Recording.of(**log, sample_time=STEP)
+    observations = setup.observe(recording)
+    motion = observations.reduced_motion
+    qd = np.asarray(motion.qd)[:, 6:]
+    regressor = np.asarray(setup.model.regressor(motion))
+    names = setup.model.parameter_names
+    for joint, speed in enumerate(speeds):
+        column = regressor[:, 6 + joint, names.index(f"fc{joint + 1}")]
+        np.testing.assert_allclose(column, np.tanh(qd[:, joint] / speed), rtol=1e-9)
+    for min_speed in (speeds, 0.1):
+        path.write_text(FILE + f"[rows]\nmin_speed = {min_speed}\n")
+        slow_setup = jid.experiment.load_experiment(path).setup
+        mask = slow_setup.observe(recording).mask
+        np.testing.assert_array_equal(mask[:, :6], observations.mask[:, :6])
+        is_fast = np.abs(qd) >= min_speed
+        np.testing.assert_array_equal(mask[:, 6:], observations.mask[:, 6:] & is_fast)
+        assert not is_fast[observations.mask[:, 6:]].all()
+
+
 def test_feet_need_a_floating_base(dog):
     folder, _ = dog
     path = folder / "fixed.toml"
