@@ -1,8 +1,8 @@
 """Rotation, place and biases of an IMU on a floating base, told by its legs.
 
-While all feet stand on level ground, the joints alone tell how the base moves, and so
-what an IMU would measure at any place. The mean of what it does measure gives its
-biases, and how it follows the motion its attitude and its place.
+While all feet stand on level ground, the joints alone tell how the base moves. This is
+compared with what the IMU measures: a constant difference is a bias, and a difference
+that depends on the motion shows another attitude or place.
 """
 
 import dataclasses
@@ -106,7 +106,7 @@ PRIOR = np.repeat([1.0 / SETTINGS.place, 0.0, 0.0], 3)
 
 
 class _ImuRows(NamedTuple):
-    """What an IMU measures while all feet stand, and what the legs tell of it.
+    """Rows of an IMU while all feet stand, as it measures them and as the legs tell.
 
     Each row is an angular velocity and an acceleration less gravity [rad/s, m/s²].
 

@@ -2,8 +2,8 @@
 
 Gravity of a load turns with a sensor at the wrist. Its forces at many attitudes tell
 along which axes the wrench is written, and whether gravity is in it at all. A sensor
-under the base does not turn: there the motion tells, since the bodies of the arm
-explain no wrench along other axes.
+under the base does not turn. There the motion of the arm tells the axes: moving bodies
+explain the wrench along the right axes only.
 """
 
 from typing import NamedTuple
