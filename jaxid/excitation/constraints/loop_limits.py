@@ -6,7 +6,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Joints
 from jaxid.program.sample_methods import evaluate_samples
-from jaxid.robot.joint_coordinates import all_rates, loop_closure
+from jaxid.robot.joint_coordinates import all_rates
 from jaxid.robot.loop_closing import MIN_SAFE_SHARE, Closure
 from jaxid.robot.robot import Robot
 
@@ -29,14 +29,14 @@ class LoopLimits(AbstractConstraint):
 
     def __call__(self, robot, motion):
         """Return the open distance, then the shares, ranges and speeds."""
-        values = Closure(robot).of_samples(motion.q)
-        coordinates = values[..., : robot.bodies]
         excess = eqx.Partial(self.excess, robot)
-        return evaluate_samples(excess, excess.__call__, coordinates, motion.qd)
+        return evaluate_samples(excess, excess.__call__, motion.q, motion.qd)
 
-    def excess(self, robot: Robot, coordinates: Joints, qd: Joints) -> AnyArray:
-        """Return the relative excess of one sample of all joints over each limit."""
-        square, share = loop_closure(robot, coordinates)
+    def excess(self, robot: Robot, q: Joints, qd: Joints) -> AnyArray:
+        """Return the relative excess of one sample over each limit."""
+        closure = Closure(robot).of_sample(q)
+        coordinates = closure[: robot.bodies]
+        square, share = closure[robot.bodies :]
         rates = all_rates(robot, coordinates, qd)
         values = [square / SIZE**2 - SIZE**2, 1.0 - share / self.min_share]
         for body, joint in _moved_joints(robot):
