@@ -629,7 +629,7 @@ def imu_rows(name: str, seconds: float) -> list[Row]:
             with tempfile.TemporaryDirectory() as folder:
                 path = write(mounting.measured(log), Path(folder) / "log.csv", 5)
                 report = jid.identify_logs(setup, [path], COLUMNS)
-            named = [text for text in report.doubts if "IMU" in text]
+            named = [x for x in report.judgement.findings if "IMU" in x.text]
             mass, error = study.mass(report.fit)[0], study.torque_error(report.fit)
             word = "named" if named else "not named"
             texts.append(f"{mass:.3f} kg, {100 * error:.2f} %, {word}")

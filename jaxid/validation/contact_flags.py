@@ -33,7 +33,7 @@ from jaxid.measurement.imu_offset import (
 )
 from jaxid.measurement.observations import observe
 from jaxid.measurement.recording import Recording
-from jaxid.result_table import significant
+from jaxid.result_table import Remark, Status, significant
 from jaxid.robot.contacts import legs_of
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot
@@ -58,6 +58,7 @@ class ContactLimits(NamedTuple):
     mass: float = 0.02  # effect of a mass at a lifted foot, over that in the trunk
     # rotation [rad], displacement [m] and biases of an IMU [rad/s, m/s²] that are usual
     imu: tuple[float, ...] = (np.deg2rad(1.0), 0.03, 0.02, 0.05)
+    turn: float = np.deg2rad(10.0)  # rotation that spoils any fit [rad]
     # what no IMU can have: unexplained [rad/s, m/s²], displacement [m] and biases
     imu_errors: tuple[float, ...] = (0.2, 1.0, 1.0, 0.5, 2.0)
 
@@ -66,10 +67,17 @@ LIMITS = ContactLimits()
 
 
 class CheckedContacts(NamedTuple):
-    """Recording whose flags may be corrected, and what was found, as sentences."""
+    """Recording whose flags may be corrected, and what was found, as sentences.
+
+    Attributes:
+        recording: Recording in which loaded legs stand.
+        findings: What needs a look.
+        mistakes: What is wrong with the IMU, so that no fit is right.
+    """
 
     recording: Recording
     findings: tuple[str, ...]
+    mistakes: tuple[str, ...] = ()
 
 
 def check_contacts(
@@ -86,10 +94,11 @@ def check_contacts(
         InputError: If the recording lacks signals of the base.
     """
     robot = base.model.robot
-    findings = [
-        *imu_findings(robot, recording, filter),
-        *_constant_flags(robot, recording),
-    ]
+    findings = _constant_flags(robot, recording)
+    mistakes = []
+    for remark in imu_remarks(robot, recording, filter):
+        texts = mistakes if remark.status is Status.BAD else findings
+        texts.append(remark.text)
     loads = _loads(base, all_standing(recording, robot), recording, filter)
     doubtful = {place: load for place, load in loads.items() if load > LIMITS.load}
     if doubtful:
@@ -115,7 +124,8 @@ def check_contacts(
         )
     signals = dataclasses.replace(signals, contacts=stands.astype(float))
     checked_recording = dataclasses.replace(recording, base=signals)
-    return CheckedContacts(checked_recording, tuple(dict.fromkeys(findings)))
+    unique_findings = tuple(dict.fromkeys(findings))
+    return CheckedContacts(checked_recording, unique_findings, tuple(mistakes))
 
 
 def _loads(
@@ -247,38 +257,40 @@ def _is_gravity(acceleration: float) -> bool:
     return abs(acceleration / STANDARD_GRAVITY - 1.0) <= LIMITS.gravity
 
 
-def imu_findings(
+def imu_remarks(
     robot: Robot, recording: Recording, filter: AbstractFilter
-) -> list[str]:
-    """Return findings on the IMU: its unit, and its frame by gravity or the legs."""
+) -> list[Remark]:
+    """Return remarks on the IMU: its unit, and its frame by gravity or the legs."""
     signals = base_of(recording, robot)
     gravity = measured_gravity(recording, robot)
     size = float(np.mean(np.linalg.norm(np.asarray(signals.accelerations), axis=1)))
     if not _is_gravity(gravity):
         # The vertical is unknown then.
-        if _is_gravity(size):
-            return [
-                "the direction of gravity does not turn as the gyroscope says: check "
-                "`gyro_unit`, and the signs and the order of the columns `gyro`."
-            ]
-        return [
+        text = (
             f"the accelerometer measures {size:.3g} m/s² on average, but gravity is "
             f"{STANDARD_GRAVITY} m/s²: check `accelerometer_unit`, and that gravity is "
             "not subtracted."
-        ]
+        )
+        if _is_gravity(size):
+            text = (
+                "the direction of gravity does not turn as the gyroscope says: check "
+                "`gyro_unit`, and the signs and the order of the columns `gyro`."
+            )
+        return [Remark(text, Status.BAD)]
     offset = identify_imu_offset(recording, robot, filter)
-    return [] if offset is None else _offset_findings(offset)
+    return [] if offset is None else _offset_remarks(offset)
 
 
-def _offset_findings(offset: ImuOffset) -> list[str]:
+def _offset_remarks(offset: ImuOffset) -> list[Remark]:
     """Return that the IMU is not as it is described, as the legs tell it."""
     sizes = np.linalg.norm(offset.values, axis=1)
     if (np.append(offset.errors, sizes[1:]) > LIMITS.imu_errors).any():
-        return [
+        text = (
             "gyroscope and accelerometer do not follow the motion that the legs tell "
             "while all feet stand: check signs and order of the columns `gyro` and "
             "`accelerometer`, and `recording.contact`."
-        ]
+        )
+        return [Remark(text, Status.BAD)]
     widths = np.linalg.norm(offset.half_widths, axis=1)
     angle, distance, rate, acceleration = sizes
     slope = np.rad2deg(acceleration / STANDARD_GRAVITY)
@@ -293,8 +305,10 @@ def _offset_findings(offset: ImuOffset) -> list[str]:
     faults = [text for text, is_fault in zip(words, is_large, strict=True) if is_fault]
     if not faults:
         return []
-    return [
+    text = (
         f"the IMU {', and '.join(faults)} against its description, as the legs tell "
         "while all feet stand: give `imu_offset = true` in `[recording]`, which "
         "estimates and removes it, or describe the IMU (`robot.imu`)."
-    ]
+    )
+    is_spoilt = angle - widths[0] > LIMITS.turn
+    return [Remark(text, Status.BAD if is_spoilt else Status.DOUBTFUL)]

@@ -55,6 +55,7 @@ class Diagnosis(Summarised):
         notes: Remarks on how the log was examined, as sentences.
         commands: Excerpt with the commanded angles as angles; None if not known.
         is_mistaken: Whether a mistake in log or robot spoils any fit.
+        imu_mistakes: What is wrong with the IMU of a floating base, as sentences.
     """
 
     log: Recording | Observations
@@ -67,6 +68,7 @@ class Diagnosis(Summarised):
     notes: tuple[str, ...] = ()
     commands: Recording | None = None
     is_mistaken: bool = False
+    imu_mistakes: tuple[str, ...] = ()
 
     def with_fit(self, fit: Fit, bodies: np.ndarray | None = None) -> "Diagnosis":
         """Return the diagnosis with findings of a fit to this log alone.
@@ -339,6 +341,15 @@ def _mistakes_in_base_wrenches(
     return LogMistakes(tuple(certain), tuple(doubts))
 
 
+def _mistakes_of_imus(diagnoses: Sequence[Diagnosis]) -> LogMistakes:
+    """Return what is wrong with the IMUs of a floating base."""
+    texts = []
+    for diagnosis in diagnoses:
+        name = f"{diagnosis.log.name}: " if len(diagnoses) > 1 else ""
+        texts += [f"{name}{text}" for text in diagnosis.imu_mistakes]
+    return LogMistakes(tuple(texts))
+
+
 def _mistakes(
     diagnoses: Sequence[Diagnosis],
     fit: Fit,
@@ -351,7 +362,7 @@ def _mistakes(
         logs = [x.observations for x in diagnoses if x.observations is not None]
         return _mistakes_in_base_wrenches(model, logs)
     if model.robot.virtual:
-        return LogMistakes()
+        return _mistakes_of_imus(diagnoses)
     recordings = []
     commands = []
     doubts = []

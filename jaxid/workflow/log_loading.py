@@ -22,7 +22,7 @@ from jaxid.measurement.recording import Recording, remove_delay
 from jaxid.measurement.time_grid import NeedsMemory
 from jaxid.robot.robot import Robot
 from jaxid.units import NM
-from jaxid.validation.contact_flags import check_contacts
+from jaxid.validation.contact_flags import CheckedContacts, check_contacts
 from jaxid.validation.diagnosis import Diagnosis, diagnose
 from jaxid.validation.torque_errors import comparison_step
 
@@ -169,10 +169,10 @@ def load_log(
     if name is not None:
         recording = dataclasses.replace(recording, name=name)
     progress(f"filtering {path.name}", 0.0)
-    contact_findings = ()
+    checked = CheckedContacts(recording, ())
     if setup.robot.contacts:
         checked = check_contacts(setup.base, recording, setup.filter)
-        recording, contact_findings = checked
+        recording = checked.recording
     observations = setup.observe(recording)
     commanded_motion = None
     if recording.commands is not None:
@@ -182,8 +182,10 @@ def load_log(
     diagnosis = diagnose(
         recording, setup.robot, observations=observations, commands=commanded_motion
     )
-    findings = (*diagnosis.findings, *contact_findings)
-    diagnosis = dataclasses.replace(diagnosis, findings=findings)
+    findings = (*diagnosis.findings, *checked.findings)
+    diagnosis = dataclasses.replace(
+        diagnosis, findings=findings, imu_mistakes=checked.mistakes
+    )
     observations = observations.replace(notes=(*observations.notes, *notes))
     return LoadedLog(observations, diagnosis)
 

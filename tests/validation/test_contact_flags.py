@@ -7,9 +7,10 @@ from scipy.spatial.transform import Rotation
 
 import jaxid as jid
 from jaxid.measurement.imu_offset import identify_imu_offset, without_imu_offset
+from jaxid.result_table import Status
 from jaxid.validation.contact_flags import (
     check_contacts,
-    imu_findings,
+    imu_remarks,
     standing_feet_findings,
 )
 
@@ -203,8 +204,9 @@ def test_a_stance_called_swing_is_named_with_its_time(dog, base):
 def test_wrong_signals_of_the_imu_are_named(dog, base, key, change, words):
     log = dog[1] | {key: change(dog[1][key])}
     recording = jid.Recording.of(**log, sample_time=STEP)
-    (text,) = imu_findings(base.model.robot, recording, jid.ZeroPhaseButterworth(10.0))
-    assert words in text
+    (remark,) = imu_remarks(base.model.robot, recording, jid.ZeroPhaseButterworth(10.0))
+    assert words in remark.text
+    assert remark.status is Status.BAD
 
 
 def turned_imu(log, turn, place, rate_bias, acceleration_bias):
@@ -237,16 +239,19 @@ def test_the_legs_tell_how_the_imu_is_mounted(dog, base, change, words):
     true |= change
     log = turned_imu(dog[1], **true)
     recording = jid.Recording.of(**log, sample_time=STEP)
-    texts = imu_findings(robot, recording, smooth)
-    assert len(texts) == bool(words)
-    assert all(words in text for text in texts)
+    remarks = imu_remarks(robot, recording, smooth)
+    assert len(remarks) == bool(words)
+    for remark in remarks:
+        assert words in remark.text
+        # Only a large turn spoils any fit.
+        assert (remark.status is Status.BAD) == ("180 degrees" in words)
     offset = identify_imu_offset(recording, robot, smooth)
     errors = np.abs(offset.values - list(true.values()))
     # Rotation [rad], place [m], biases [rad/s, m/s²].
     assert (errors.max(axis=1) < [0.004, 0.004, 0.001, 0.04]).all()
     # What is corrected is what the IMU of the description measures.
     corrected = without_imu_offset(recording, robot, smooth)
-    assert imu_findings(robot, corrected, smooth) == []
+    assert imu_remarks(robot, corrected, smooth) == []
     inner = slice(50, -50)
     for name, size in (("rates", 0.005), ("accelerations", 0.06)):
         channel = {"rates": "gyro", "accelerations": "accelerometer"}[name]
@@ -297,6 +302,15 @@ def test_logs_of_legs_are_identified_and_equal_legs_compared(dog, base, tmp_path
     assert "`b2`" in difference
     assert "1.0 and not 0.30" in difference
     assert not any("lift these feet" in text for text in texts)
+
+    # A gyroscope in degrees comes first: what it spoils is no reason to record again.
+    first_gyro = names.index("gyro1") + 1
+    table[:, first_gyro : first_gyro + 3] *= 180.0 / np.pi
+    np.savetxt(path, table, delimiter=",", header=header, comments="")
+    report = jid.identify_logs(jid.Setup(base), [path], decoded.columns)
+    first = report.judgement.findings[0]
+    assert first.status is Status.BAD
+    assert "gyro_unit" in first.text
 
     # Without its last phase the log never lifts the foot `d`.
     part = {key: x[: -round(PHASE / STEP)] for key, x in log.items()}
