@@ -146,20 +146,31 @@ def coverage_row(name, case, draws):
     truth = base.from_standard(np.concatenate([case.bodies, friction]))
     forces = case.forces(motion)
     forces += VISCOUS * motion.qd + DRY * np.tanh(motion.qd / 0.02)
-    random = np.random.default_rng(4)
-    inside = []
-    for _ in range(draws):
-        noisy = forces + random.normal(0.0, NOISE, forces.shape)
-        observations = jid.Observations.of(
-            motion.q, motion.qd, motion.qdd, noisy, sample_time=1 / RATE
-        )
-        fit = jid.identify(base, observations)
-        low, high = np.asarray(fit.intervals()).T
-        inside.append((low < truth) & (truth < high))
+    fits = fits_of_draws(base, motion, forces, draws)
+    inside = [holds_truth(fit, truth) for fit in fits]
     share = 100 * float(np.mean(inside))
     what = "95 % intervals that hold the truth"
     holds = 93 <= share <= 97
     return Row(name, what, f"{draws} draws", "93 to 97 %", f"{share:.1f} %", holds)
+
+
+def fits_of_draws(base, motion, forces, draws):
+    """Yield a fit for each draw of the forces' noise."""
+    random = np.random.default_rng(4)
+    for _ in range(draws):
+        noisy = forces + random.normal(0.0, NOISE, forces.shape)
+        yield jid.identify(
+            base,
+            jid.Observations.of(
+                motion.q, motion.qd, motion.qdd, noisy, sample_time=1 / RATE
+            ),
+        )
+
+
+def holds_truth(fit, truth):
+    """Return whether the interval of each parameter holds its true value."""
+    low, high = np.asarray(fit.intervals()).T
+    return (low < truth) & (truth < high)
 
 
 def passive_friction_row(name, case, draws):
@@ -188,16 +199,9 @@ def passive_friction_row(name, case, draws):
         base = jid.base_parameters(model)
         parameters = np.concatenate([case.bodies, friction, friction_of_all])
         truth = base.from_standard(parameters[: model.size])
-        random = np.random.default_rng(4)
         squares, inside = [], []
-        for _ in range(draws):
-            noisy = forces + random.normal(0.0, NOISE, forces.shape)
-            observations = jid.Observations.of(
-                motion.q, motion.qd, motion.qdd, noisy, sample_time=1 / RATE
-            )
-            fit = jid.identify(base, observations)
-            low, high = np.asarray(fit.intervals()).T
-            inside.append((low < truth) & (truth < high))
+        for fit in fits_of_draws(base, motion, forces, draws):
+            inside.append(holds_truth(fit, truth))
             squares.append(np.sum((fit.predict(unseen) - expected) ** 2))
         error = 100 * np.sqrt(np.mean(squares) / np.sum(expected**2))
         share = 100 * float(np.mean(inside))

@@ -254,29 +254,45 @@ class MotionsOnFeet:
 
     def phase(self, number: int, coefficients: np.ndarray) -> Phase:
         """Return the motion of a phase: all feet stand in that of number 0."""
-        share = self.times / self.duration
-        share = np.minimum(share, 1.0 - share)
-        waves = self.rows @ coefficients.T
-        count = len(share)
-        q = np.tile(self.pose, (count, 1))
-        q[:, :GROUP] += waves[:, :GROUP]
-        q[:, :2] += smooth_step(share / self.sizes.lean)[:, None] * self.shifts[number]
-        q[:, self.other_joints] += waves[:, GROUP:-GROUP]
-        places = FootPlaces(*(np.repeat(x, count, axis=0) for x in self.home))
         foot = number - 1 if number else None
-        if foot is not None:
-            lift = smooth_step((share - self.sizes.lean) / LIFT_SHARE)
-            wave = lift[:, None] * waves[:, -GROUP:]
-            wave[:, 2] += lift * self.sizes.lift * self.pose[2]
-            turn = scipy.spatial.transform.Rotation.from_rotvec(wave[:, 3:]).as_matrix()
-            places.positions[:, foot] += wave[:, :3]
-            places.rotations[:, foot] = turn @ places.rotations[:, foot]
+        waves = self.rows @ coefficients.T
+        q = self._swaying(waves, self.shifts[number])
+        places = self._foot_places(waves[:, -GROUP:], foot)
         q = place_feet(self.legs, q, places)
         spline = None
         if not np.isnan(q).any():
             spline = interpolate_at_rest(self.times, q)
         lean = self.sizes.lean * self.duration
         return Phase(coefficients, spline, foot, (lean, self.duration - lean))
+
+    @property
+    def _share(self) -> np.ndarray:
+        """Distance of each instant from the nearer end of a phase, over its length."""
+        share = self.times / self.duration
+        return np.minimum(share, 1.0 - share)
+
+    def _swaying(self, waves: np.ndarray, shift: np.ndarray) -> np.ndarray:
+        """Return the coordinates of trunk and other joints, legs as in the pose."""
+        lean = smooth_step(self._share / self.sizes.lean)
+        q = np.tile(self.pose, (len(lean), 1))
+        q[:, :GROUP] += waves[:, :GROUP]
+        q[:, :2] += lean[:, None] * shift
+        q[:, self.other_joints] += waves[:, GROUP:-GROUP]
+        return q
+
+    def _foot_places(self, waves: np.ndarray, foot: int | None) -> FootPlaces:
+        """Return where all feet are; one of them follows waves in the air."""
+        count = len(waves)
+        places = FootPlaces(*(np.repeat(x, count, axis=0) for x in self.home))
+        if foot is None:
+            return places
+        lift = smooth_step((self._share - self.sizes.lean) / LIFT_SHARE)
+        wave = lift[:, None] * waves
+        wave[:, 2] += lift * self.sizes.lift * self.pose[2]
+        turns = scipy.spatial.transform.Rotation.from_rotvec(wave[:, 3:])
+        places.positions[:, foot] += wave[:, :3]
+        places.rotations[:, foot] = turns.as_matrix() @ places.rotations[:, foot]
+        return places
 
     def trajectory(self, phases: Sequence[Phase]) -> MotionOnFeet:
         """Return the motion of all phases in turn."""

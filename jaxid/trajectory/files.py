@@ -109,9 +109,10 @@ def write_csv(
     times, motion = _sample(trajectory, robot, sample_time)
     columns = {"time [s]": times}
     for symbol, rate in (("q", ""), ("qd", "/s"), ("qdd", "/s^2")):
+        values = np.asarray(getattr(motion, symbol))
         for j, name in enumerate(robot.joint_names):
-            header = f"{symbol}_{name} [{robot.joint_unit(j)}{rate}]"
-            columns[header] = np.asarray(getattr(motion, symbol))[:, j]
+            unit = f"{robot.joint_unit(j)}{rate}"
+            columns[f"{symbol}_{name} [{unit}]"] = values[:, j]
     columns |= trajectory.columns(times)
     write_text(path, pl.DataFrame(columns).write_csv())
 
