@@ -354,6 +354,7 @@ def recording(
     return jid.Recording.of(**channels, sample_time=SAMPLE_TIME, name=name)
 
 
+DOUBTS = (jid.result_table.Status.BAD, jid.result_table.Status.DOUBTFUL)
 COLUMNS = jid.Columns(
     angles="q{}",
     forces="tau{}",
@@ -629,7 +630,8 @@ def imu_rows(name: str, seconds: float) -> list[Row]:
             with tempfile.TemporaryDirectory() as folder:
                 path = write(mounting.measured(log), Path(folder) / "log.csv", 5)
                 report = jid.identify_logs(setup, [path], COLUMNS)
-            named = [x for x in report.judgement.findings if "IMU" in x.text]
+            doubts = [x for x in report.judgement.findings if x.status in DOUBTS]
+            named = [x for x in doubts if "IMU" in x.text]
             mass, error = study.mass(report.fit)[0], study.torque_error(report.fit)
             word = "named" if named else "not named"
             texts.append(f"{mass:.3f} kg, {100 * error:.2f} %, {word}")

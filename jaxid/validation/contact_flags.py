@@ -59,6 +59,7 @@ class ContactLimits(NamedTuple):
     # rotation [rad], displacement [m] and biases of an IMU [rad/s, m/s²] that are usual
     imu: tuple[float, ...] = (np.deg2rad(1.0), 0.03, 0.02, 0.05)
     turn: float = np.deg2rad(10.0)  # rotation that spoils any fit [rad]
+    slip: float = 2.0  # error of feet that slip, over half of the 95 % interval
     # what no IMU can have: unexplained [rad/s, m/s²], displacement [m] and biases
     imu_errors: tuple[float, ...] = (0.2, 1.0, 1.0, 0.5, 2.0)
 
@@ -291,8 +292,10 @@ def _offset_remarks(offset: ImuOffset) -> list[Remark]:
             "`accelerometer`, and `recording.contact`."
         )
         return [Remark(text, Status.BAD)]
-    widths = np.linalg.norm(offset.half_widths, axis=1)
-    angle, distance, rate, acceleration = sizes
+    # Each axis for itself: a well-known one counts where another is hardly known.
+    certain_sizes = np.abs(offset.values) - LIMITS.slip * offset.half_widths
+    known_values = np.where(certain_sizes > 0, offset.values, 0.0)
+    angle, distance, rate, acceleration = np.linalg.norm(known_values, axis=1)
     slope = np.rad2deg(acceleration / STANDARD_GRAVITY)
     words = (
         f"is turned by {significant(np.rad2deg(angle), 2)} degrees",
@@ -301,7 +304,7 @@ def _offset_remarks(offset: ImuOffset) -> list[Remark]:
         f"has an accelerometer with a bias of {significant(acceleration, 2)} m/s² (or "
         f"the ground slopes by {slope:.1f} degrees)",
     )
-    is_large = sizes - widths > LIMITS.imu
+    is_large = certain_sizes.max(axis=1) > LIMITS.imu
     faults = [text for text, is_fault in zip(words, is_large, strict=True) if is_fault]
     if not faults:
         return []
@@ -310,5 +313,5 @@ def _offset_remarks(offset: ImuOffset) -> list[Remark]:
         "while all feet stand: give `imu_offset = true` in `[recording]`, which "
         "estimates and removes it, or describe the IMU (`robot.imu`)."
     )
-    is_spoilt = angle - widths[0] > LIMITS.turn
+    is_spoilt = certain_sizes[0].max() > LIMITS.turn
     return [Remark(text, Status.BAD if is_spoilt else Status.DOUBTFUL)]
