@@ -185,11 +185,16 @@ def section(name, found):
     return lines + table(HEAD, cells)
 
 
-def write_tables():
-    """Write all stored figures as tables."""
+def tables():
+    """Return all stored figures as tables."""
     parts = [section(s.name, found) for s in SCRIPTS if (found := stored(s.name))]
     head = "# Measured figures\n\nWritten by `python benchmarks/run.py`.\n\n"
-    write(RESULTS / "measured.md", head + "\n".join(parts))
+    return head + "\n".join(parts)
+
+
+def write_tables():
+    """Write the tables of all stored figures."""
+    write(RESULTS / "measured.md", tables())
 
 
 def measure_all(scripts, resume):

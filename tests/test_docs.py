@@ -4,6 +4,7 @@ The names in `given` are those that a page may use without defining them.
 """
 
 import contextlib
+import importlib
 import io
 import json
 import os
@@ -401,3 +402,10 @@ def test_every_guide_is_in_the_site_and_in_the_readme():
         assert f"](docs/{page.name})" in readme
     for notebook in (ROOT / "notebooks").glob("*.ipynb"):
         assert f"](notebooks/{notebook.name})" in readme
+
+
+def test_table_of_measured_figures_is_written_from_the_stored_ones(monkeypatch):
+    monkeypatch.syspath_prepend(ROOT / "benchmarks")
+    tables = importlib.import_module("run").tables()
+    written = ROOT / "benchmarks/results/measured.md"
+    assert tables == written.read_text(encoding="utf-8")
