@@ -119,8 +119,9 @@ def fit_of(model, p):
 
 def projected_mass_matrix(model, p, q):
     """Return M as the paper forms it: the sum of F^T M_i F of all bodies (Eq. 38)."""
-    rest = jnp.zeros_like(q)
-    F = jax.jacfwd(jid.dynamics.partial_velocities(model.robot, q, rest, rest))(rest)
+    F = jnp.zeros((len(q), 6, len(q)))
+    for body, joint, row in jid.dynamics.partial_velocities(model.robot, q):
+        F = F.at[body, :, joint].set(row)
     total = jnp.zeros((len(q), len(q)))
     bodies = np.zeros((len(q), 10))
     for term, values in model.split(p):

@@ -13,7 +13,7 @@ from jaxid.identification.fit_result import Fit
 from jaxid.program import Program, trace
 from jaxid.robot.inertia import BodyParameters
 
-from .equivalent_description import simplest_description
+from .bodies_of_base_parameters import body_forces, carry_inward
 
 
 def body_parameters(model: Model, p: Float[AnyArray, " standard"]) -> BodyParameters:
@@ -48,12 +48,13 @@ def torques(fit: Fit) -> Callable[..., Any]:
     if model.robot.virtual:
         # The forces of virtual joints belong to these bodies and no others.
         return functools.partial(model.forces, fit.standard_parameters)
-    bodies = body_parameters(model, fit.standard_parameters)
-    description = simplest_description(model.robot, bodies)
+    bodies = carry_inward(
+        model.robot, body_parameters(model, fit.standard_parameters)
+    )
     remaining_forces = other_forces(fit)
 
     def forces(q, qd, qdd, s=None):
-        return description.forces(q, qd, qdd) + remaining_forces(q, qd, qdd, s)
+        return body_forces(model.robot, bodies, q, qd, qdd) + remaining_forces(q, qd, qdd, s)
 
     return forces
 
