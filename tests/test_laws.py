@@ -17,16 +17,16 @@ ARM = jid.robots.planar_arm(2, 0.4)
 ODD = (
     jid.ViscousFriction(),
     jid.CoulombFriction(),
-    jid.CoulombFriction(jid.terms.HardSign(dead_zone=0.01)),
+    jid.CoulombFriction(jid.terms.HardSign()),
     jid.terms.StribeckFriction(),
     jid.terms.StribeckFriction(0.3, exponent=1.3),
     jid.terms.TemperatureScaled(jid.ViscousFriction(), rate=0.02, temperature=40.0),
     *(term() for term in TERMS.values() if term.shares_friction),
 )
-# With a tanh the second of these is an offset as well, which pushes near standstill.
+# The second of these is an offset as well: with a tanh it pushes near standstill.
 ASYMMETRIC = (
     jid.terms.AsymmetricViscousFriction(),
-    jid.terms.AsymmetricCoulombFriction(jid.terms.HardSign(dead_zone=0.01)),
+    jid.terms.AsymmetricCoulombFriction(jid.terms.HardSign()),
 )
 few = settings(max_examples=10)
 seeds = st.integers(0, 1000)
@@ -53,7 +53,6 @@ def test_symmetric_friction_is_odd(term, seed, qd):
 @given(seed=seeds, qd=speeds)
 def test_friction_takes_energy_on_every_joint(term, seed, qd):
     assert (friction(term, seed, qd) * qd >= 0.0).all()
-    assert (friction(term, seed, 0.0 * qd) == 0.0).all()
 
 
 @few

@@ -48,13 +48,13 @@ def torques(fit: Fit) -> Callable[..., Any]:
     if model.robot.virtual:
         # The forces of virtual joints belong to these bodies and no others.
         return functools.partial(model.forces, fit.standard_parameters)
-    bodies = carry_inward(
-        model.robot, body_parameters(model, fit.standard_parameters)
-    )
+    bodies = carry_inward(model.robot, body_parameters(model, fit.standard_parameters))
     remaining_forces = other_forces(fit)
 
     def forces(q, qd, qdd, s=None):
-        return body_forces(model.robot, bodies, q, qd, qdd) + remaining_forces(q, qd, qdd, s)
+        return body_forces(model.robot, bodies, q, qd, qdd) + remaining_forces(
+            q, qd, qdd, s
+        )
 
     return forces
 

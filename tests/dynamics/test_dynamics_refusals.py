@@ -10,7 +10,6 @@ from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import (
     CoulombFriction,
     CoupledDrives,
-    HardSign,
     LinearSpring,
     RigidBodies,
     StribeckFriction,
@@ -52,8 +51,6 @@ def of_numbers_for_another_robot():
     three = (0.1, 0.2, 0.3)
     for term, name in (
         (CoulombFriction(Tanh(three)), "epsilon"),
-        (CoulombFriction(Tanh(dead_zone=three)), "dead_zone"),
-        (CoulombFriction(HardSign(three)), "dead_zone"),
         (StribeckFriction(speed=three), "speed"),
         (StribeckFriction(exponent=three), "exponent"),
         (LinearSpring(three), "rest"),

@@ -55,8 +55,8 @@ ALL = [
     RigidBodies(principal_axes=True),
     ViscousFriction(),
     CoulombFriction(),
-    CoulombFriction(HardSign(dead_zone=0.1)),
-    CoulombFriction(Tanh(np.array([0.01, 0.001, 0.02]), dead_zone=0.05)),
+    CoulombFriction(HardSign()),
+    CoulombFriction(Tanh(np.array([0.01, 0.001, 0.02]))),
     AsymmetricCoulombFriction(),
     ConstantOffset(),
     RotorInertia(),
@@ -200,22 +200,6 @@ def test_asymmetric_friction_is_symmetric_friction_with_an_offset(robot):
     dry = _columns(CoulombFriction(), robot) @ (0.5 * (fcp + fcn))
     offset = _columns(ConstantOffset(), robot) @ (0.5 * (fcp - fcn))
     np.testing.assert_allclose(found, dry + offset, rtol=1e-14)
-
-
-@pytest.mark.parametrize("transition", [Tanh, HardSign])
-def test_dead_zone_says_nothing_about_standstill(transition):
-    qd = jnp.asarray([-0.3, -0.05, 0.0, 0.05, 0.1, 0.1001])
-    found = np.asarray(transition(dead_zone=0.1)(qd))
-    open_ended = np.asarray(transition()(qd))
-    np.testing.assert_array_equal(found, np.where(np.abs(qd) > 0.1, open_ended, 0.0))
-    np.testing.assert_array_equal(found[1:5], 0.0)
-    assert found[0] < -0.99
-    assert found[5] > 0.99
-    each = np.asarray(
-        transition(dead_zone=np.array([0.2, 0.4]))(jnp.asarray([0.3, 0.3]))
-    )
-    assert each[0] > 0.99
-    assert each[1] == 0.0
 
 
 def test_ripple_is_that_of_the_motors_and_joints(robot):

@@ -48,11 +48,9 @@ class Tanh(AbstractTransition):
         epsilon: Speed of the transition, one for all joints or one for each, in the
             joint's own unit [rad/s or m/s]; by default it is found from the logs
             (`identify_transition_speeds`), and 0.01 before.
-        dead_zone: Speed below which there is no force, likewise [rad/s or m/s].
     """
 
     epsilon: EachJoint | None = eqx.field(converter=one_or_each, default=None)
-    dead_zone: EachJoint = eqx.field(converter=one_or_each, default=0.0)
 
     def __check_init__(self):
         speed = self.speed
@@ -69,8 +67,7 @@ class Tanh(AbstractTransition):
 
     def __call__(self, qd):
         """Return the smooth sign of the speed."""
-        sign = jnp.tanh(qd / matching("epsilon", self.speed, qd))
-        return _outside_dead_zone(self.dead_zone, qd, sign)
+        return jnp.tanh(qd / matching("epsilon", self.speed, qd))
 
 
 def is_open(part: Any) -> bool:
@@ -84,17 +81,11 @@ def has_open_transition(terms: Any) -> bool:
 
 
 class HardSign(AbstractTransition):
-    """The sign of the speed, which is undefined at standstill: use a dead zone there.
-
-    Attributes:
-        dead_zone: Speed below which there is no force [rad/s or m/s].
-    """
-
-    dead_zone: EachJoint = eqx.field(converter=one_or_each, default=0.0)
+    """The sign of the speed; zero at standstill."""
 
     def __call__(self, qd):
         """Return the sign of the speed."""
-        return _outside_dead_zone(self.dead_zone, qd, jnp.sign(qd))
+        return jnp.sign(qd)
 
 
 class Presliding(AbstractTransition):
@@ -210,11 +201,3 @@ class Reversal(AbstractTransition):
         share = nearness**2 * (3 - 2 * nearness)
         value = self.transition(qd)
         return value + share * (self.side - value)
-
-
-def _outside_dead_zone(dead_zone: EachJoint, qd: Joints, value: Joints):
-    """Return a value for speeds beyond the dead zone, and zero within it."""
-    if not isinstance(dead_zone, jax.Array) and not np.any(dead_zone):
-        return value
-    is_moving = jnp.abs(qd) > matching("dead_zone", dead_zone, qd)
-    return jnp.where(is_moving, value, jnp.zeros_like(value))

@@ -1,9 +1,6 @@
 """Friction of joints: terms that depend on speed, load and temperature."""
 
-from typing import Any
-
 import equinox as eqx
-import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -106,13 +103,8 @@ class AsymmetricCoulombFriction(AbstractDryFriction):
     def columns(self, robot, q, qd, qdd):
         """Return the fractions of the two directions."""
         s = self.transition(qd)
-        dead_zone = getattr(self.transition, "dead_zone", 0.0)
-        motion_mask: Any = 1.0
-        if isinstance(dead_zone, jax.Array) or np.any(dead_zone):
-            # Within a dead zone both fractions vanish, as the force does.
-            motion_mask = jnp.where(s == 0.0, s, jnp.ones_like(s))
-        forward_fractions = on_drives(robot, 0.5 * (motion_mask + s))
-        backward_fractions = on_drives(robot, 0.5 * (s - motion_mask))
+        forward_fractions = on_drives(robot, 0.5 * (1.0 + s))
+        backward_fractions = on_drives(robot, 0.5 * (s - 1.0))
         return jnp.concatenate([forward_fractions, backward_fractions], axis=1)
 
 
