@@ -30,7 +30,9 @@ ASYMMETRIC = (
 )
 few = settings(max_examples=10)
 seeds = st.integers(0, 1000)
-speeds = st.lists(st.floats(-20.0, 20.0), min_size=2, max_size=2).map(np.array)
+# XLA takes subnormal numbers for zero.
+speed = st.floats(-20.0, 20.0, allow_subnormal=False)
+speeds = st.lists(speed, min_size=2, max_size=2).map(np.array)
 
 
 def friction(term, seed, qd):
