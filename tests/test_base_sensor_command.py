@@ -9,7 +9,7 @@ from test_cli import refused, run  # noqa: F401
 
 import jaxid as jid
 from jaxid.result_table import Status
-from jaxid.validation.wrench_checks import base_wrench_remarks
+from jaxid.validation.wrench_checks import wrench_remarks
 from jaxid.workflow.log_loading import read_log
 
 mujoco = pytest.importorskip("mujoco", reason="MuJoCo is not installed")
@@ -95,9 +95,15 @@ def cell(tmp_path_factory):
         "turned": Rotation.from_euler("z", 90, degrees=True).as_matrix(),
         "tilted": Rotation.from_rotvec([0.035, 0.0, 0.0]).as_matrix(),
     }
-    maps = {name: np.kron(np.eye(2), R.T) for name, R in turn.items()}
+    both = np.eye(2)
+    maps = {name: np.kron(both, R.T) for name, R in turn.items()}
     maps["opposite"] = -np.eye(6)
     maps["exchanged"] = np.kron([[0, 1], [1, 0]], np.eye(3))
+    maps["columns"] = np.kron(both, np.eye(3)[[1, 0, 2]])
+    maps["units"] = np.diag([1, 1, 1, 1000, 1000, 1000])
+    # The origin is 3 cm along x, and 4 cm along y, from where it is described.
+    maps["displaced"] = np.eye(6)
+    maps["displaced"][3:, :3] = [[0, 0, -0.04], [0, 0, 0.03], [0.04, -0.03, 0]]
     logs = {"a": clean, "b": other}
     for name, matrix in maps.items():
         logs[name] = np.hstack([clean[:, :6], clean[:, 6:] @ matrix.T])
@@ -182,14 +188,18 @@ def test_a_wrong_frame_is_named(cell):
         "exchanged": ("exchanged",),
         "turned": ("by 90 degrees",),
         "tilted": ("by 2.0 degrees",),
+        "columns": ("left-handed", "by 180 degrees"),
+        "units": ("N mm",),
+        "displaced": ("by 50 mm",),
     }
+    small = ("tilted", "displaced")
     for name, texts in words.items():
         log = setup.observe(read_log(setup, cell / f"{name}.csv", columns))
-        remarks = base_wrench_remarks(setup.model, log)
+        remarks = wrench_remarks(setup.model, log)
         assert len(remarks) == len(texts), (name, remarks)
         for remark, text in zip(remarks, texts, strict=True):
             assert text in remark.text
-            assert remark.status is Status.BAD
+            assert (remark.status is Status.BAD) == (name not in small)
 
 
 def test_the_attitude_that_is_named_is_the_cure(cell, tmp_path):
@@ -200,10 +210,21 @@ def test_the_attitude_that_is_named_is_the_cure(cell, tmp_path):
     experiment = jid.experiment.load_experiment(cell / "e.toml")
     setup, columns = experiment.identification([cell / "turned.csv"])
     log = setup.observe(read_log(setup, cell / "turned.csv", columns))
-    (remark,) = base_wrench_remarks(setup.model, log)
+    (remark,) = wrench_remarks(setup.model, log)
     numbers = remark.text.partition("about [")[2].partition("]")[0]
     named = Rotation.from_euler("xyz", json.loads(f"[{numbers}]"), degrees=True)
     assert (named.inv() * right).magnitude() < np.deg2rad(1.0)
+
+
+def test_the_place_that_is_named_is_the_cure(cell):
+    experiment = jid.experiment.load_experiment(cell / "e.toml")
+    setup, columns = experiment.identification([cell / "displaced.csv"])
+    log = setup.observe(read_log(setup, cell / "displaced.csv", columns))
+    (remark,) = wrench_remarks(setup.model, log)
+    numbers = remark.text.partition("about [")[2].partition("]")[0]
+    described = Rotation.from_euler("xyz", ROTATION, degrees=True)
+    right = POSITION + described.apply([0.03, 0.04, 0.0])
+    np.testing.assert_allclose(json.loads(f"[{numbers}]"), right, atol=0.002)
 
 
 def test_refusals(here, run):  # noqa: F811

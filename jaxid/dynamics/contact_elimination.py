@@ -4,33 +4,45 @@ import numpy as np
 
 from jaxid.arrays import AnyArray
 from jaxid.robot.contacts import legs_of
-from jaxid.robot.forward_kinematics import tip_jacobian
+from jaxid.robot.forward_kinematics import TipJacobian, tip_jacobian
 from jaxid.robot.robot import Robot
 
 from .motion import Motion
 
 
-def contact_jacobians(robot: Robot, q: AnyArray, up: AnyArray) -> list[np.ndarray]:
-    """Return for each contact the motions on which its forces do work.
+def contact_tips(robot: Robot, q: AnyArray) -> list[TipJacobian]:
+    """Return placements of each contact, and their derivatives.
 
     Args:
         robot: Robot with contacts.
         q: Coordinates [samples joints].
+    """
+    feet = [
+        robot.replace(tip_body=contact.body, tip_offset=contact.position)
+        for contact in robot.contacts
+    ]
+    return [tip_jacobian(foot, np.asarray(q)) for foot in feet]
+
+
+def contact_jacobians(
+    robot: Robot, tips: list[TipJacobian], up: AnyArray
+) -> list[np.ndarray]:
+    """Return for each contact the motions on which its forces do work.
+
+    Args:
+        robot: Robot with contacts.
+        tips: Placements of the contacts.
         up: Unit vector against gravity in the frame of the base [samples 3].
 
     Returns:
         Jacobians [samples joints forces].
     """
-    jacobians = []
-    for contact in robot.contacts:
-        foot = robot.replace(tip_body=contact.body, tip_offset=contact.position)
-        tip = tip_jacobian(foot, np.asarray(q))
-        # Joints in the order of their numbers.
-        order = np.argsort(robot.order)
-        velocity = tip.velocity[:, order]
-        turn = tip.turn[:, order]
-        jacobians.append(contact.shape.jacobian(velocity, turn, up))
-    return jacobians
+    # Joints in the order of their numbers.
+    order = np.argsort(robot.order)
+    return [
+        contact.shape.jacobian(tip.velocity[:, order], tip.turn[:, order], up)
+        for contact, tip in zip(robot.contacts, tips, strict=True)
+    ]
 
 
 def elimination(
@@ -49,7 +61,8 @@ def elimination(
     """
     legs = legs_of(robot)
     matrices = []
-    for number, jacobian in enumerate(contact_jacobians(robot, q, up)):
+    jacobians = contact_jacobians(robot, contact_tips(robot, q), up)
+    for number, jacobian in enumerate(jacobians):
         force_of_leg = np.linalg.pinv(jacobian[:, list(legs.own_joints[number])])
         X = jacobian[:, list(legs.rows)] @ force_of_leg
         matrices.append(np.where(stands[:, number, None, None], X, 0.0))

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxid.arrays import AnyArray
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.contact_elimination import contact_jacobians
+from jaxid.dynamics.contact_elimination import contact_jacobians, contact_tips
 from jaxid.dynamics.motion import Motion, floating_motion
 from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.robot import GRAVITY, Robot
@@ -106,7 +106,9 @@ def ground_forces(
         axis=1,
     )
     friction = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
-    jacobians = contact_jacobians(base.model.robot, trunk.motion.q, trunk.up)
+    robot = base.model.robot
+    tips = contact_tips(robot, trunk.motion.q)
+    jacobians = contact_jacobians(robot, tips, trunk.up)
     scale = np.array([1.0, 1.0, 1.0, *[MOMENT_ARM] * 3])
     parts = [
         scale[: jacobian.shape[2]] * jacobian * stands[:, foot, None, None]

@@ -12,10 +12,10 @@ import numpy as np
 import scipy
 
 from jaxid.arrays import AnyArray, Float, Matrix3, Vector3
+from jaxid.dynamics.contact_elimination import contact_jacobians, contact_tips
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.result_table import significant
-from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
 from jaxid.robot.virtual_joints import GROUP
@@ -24,7 +24,7 @@ from .filters import AbstractFilter
 from .floating_base import base_of, contact_grid, plane_normal
 from .recording import Recording
 from .samples import joint_side
-from .sensor_turns import TurnedVectors
+from .sensor_turns import SensorRows, half_widths
 
 STANDARD_GRAVITY = 9.81
 """Acceleration of gravity [m/s²]."""
@@ -36,7 +36,6 @@ class ImuSettings(NamedTuple):
     max_step: float = 0.01  # time between two rows, at most [s]
     min_time: float = 2.0  # time in which all feet stand [s]
     block_time: float = 0.5  # errors of different blocks are independent [s]
-    student: float = 2.2  # 95 % interval over the deviation, of some ten blocks
     tie: float = 1.22  # ratio of the errors of equally good attitudes
     place: float = 0.1  # standard deviation of the place before the log [m]
     noise: tuple[float, float] = (0.02, 0.2)  # errors at first [rad/s, m/s²]
@@ -102,71 +101,7 @@ class ImuOffset(NamedTuple):
 
 
 PRIOR = np.repeat([1.0 / SETTINGS.place, 0.0, 0.0], 3)
-"""Inverse of the standard deviations of place and biases before the log."""
-
-
-class _ImuRows(NamedTuple):
-    """Rows of an IMU while all feet stand, as it measures them and as the legs tell.
-
-    Each row is an angular velocity and an acceleration less gravity [rad/s, m/s²].
-
-    Attributes:
-        measured: Measured rows, with their biases.
-        known: Rows of an IMU as it is described, as the legs tell them.
-        columns: Columns of its displacement in the base, and of the two biases along
-            the described axes.
-        blocks: Number of the block of time of each row.
-    """
-
-    measured: Float[np.ndarray, "rows 2 3"]
-    known: Float[np.ndarray, "rows 2 3"]
-    columns: Float[np.ndarray, "rows 2 3 9"]
-    blocks: AnyArray
-
-    def vectors(self, noise: np.ndarray) -> TurnedVectors:
-        """Return the rows with the standard deviations of their errors."""
-        return TurnedVectors.of(self.measured, self.known, self.columns, noise, PRIOR)
-
-    def errors(self, turn: Matrix3, unknowns: np.ndarray) -> np.ndarray:
-        """Return what is unexplained of turned rows."""
-        return self.measured @ turn.T - self.known - self.columns @ unknowns
-
-    def sizes(self, turn: Matrix3, unknowns: np.ndarray) -> np.ndarray:
-        """Return the RMS of the errors of angular velocities and accelerations."""
-        return np.sqrt(np.mean(self.errors(turn, unknowns) ** 2, axis=(0, 2)))
-
-    def slopes(self, unknowns: np.ndarray) -> Float[np.ndarray, "rows 2 3 12"]:
-        """Return the columns of a small turn, and of the unknowns."""
-        displacement = self.columns[..., :3] @ unknowns[:3]
-        motion = self.known + displacement
-        turn_columns = [np.cross(motion, axis)[..., None] for axis in np.eye(3)]
-        return np.concatenate([*turn_columns, self.columns], axis=3)
-
-    def half_widths(
-        self, turn: Matrix3, unknowns: np.ndarray, noise: np.ndarray
-    ) -> Float[np.ndarray, "4 3"]:
-        """Return half of the 95 % intervals of the estimates.
-
-        Errors in blocks of time tell how uncertain the unknowns are.
-        """
-        slopes = self.slopes(unknowns) / noise[:, None, None]
-        errors = self.errors(turn, unknowns) / noise[:, None]
-        gradients = np.einsum("nbai,nba->ni", slopes, errors)
-        sums = np.zeros((self.blocks.max() + 1, 12))
-        np.add.at(sums, self.blocks, gradients)
-
-        prior = np.zeros((12, 12))
-        prior[3:, 3:] = np.diag(PRIOR**2)
-        products = np.einsum("nbai,nbaj->ij", slopes, slopes)
-        information = products + prior
-        inverse = np.linalg.pinv(information, rcond=1e-12, hermitian=True)
-        variation = sums.T @ sums + prior
-        covariance = inverse @ variation @ inverse
-        # All estimates but the place are along the axes of the IMU.
-        axes = scipy.linalg.block_diag(turn, np.eye(3), turn, turn)
-        variances = np.diag(axes.T @ covariance @ axes)
-        half_widths = SETTINGS.student * np.sqrt(variances)
-        return half_widths.reshape(4, 3)
+"""Inverse of the standard deviations of displacement and biases before the log."""
 
 
 def without_imu_offset(
@@ -197,23 +132,17 @@ def identify_imu_offset(
     rows = _imu_rows(recording, robot, filter)
     if rows is None:
         return None
-    noise = np.array(SETTINGS.noise)
-    vectors = rows.vectors(noise)
-    turn = vectors.least_turn(SETTINGS.tie)
-    # The final estimate uses the errors that are found.
-    noise = rows.sizes(turn, vectors.unknowns(turn))
-    vectors = rows.vectors(noise)
-    turn = vectors.turn_near(turn)
-
-    unknowns = vectors.unknowns(turn)
-    angles = scipy.spatial.transform.Rotation.from_matrix(turn).as_rotvec()
-    values = np.append(angles, unknowns).reshape(4, 3)
-    values[2:] = values[2:] @ turn
+    estimate = rows.estimate(np.array(SETTINGS.noise), SETTINGS.tie)
+    turn = estimate.turn
+    # All values but the place are along the axes of the IMU.
+    axes = scipy.linalg.block_diag(turn, np.eye(3), turn, turn)
+    values = np.append(estimate.angles, estimate.unknowns) @ axes
+    covariance = axes.T @ estimate.covariance @ axes
     return ImuOffset(
         attitude=rpy_rotation(robot.imu.rpy) @ turn,
-        values=values,
-        half_widths=rows.half_widths(turn, unknowns, noise),
-        errors=rows.sizes(turn, unknowns),
+        values=values.reshape(4, 3),
+        half_widths=half_widths(covariance).reshape(4, 3),
+        errors=estimate.errors,
     )
 
 
@@ -224,7 +153,7 @@ def _acceleration_at(arm: Vector3, rates: AnyArray, changes: AnyArray) -> np.nda
 
 def _imu_rows(
     recording: Recording, robot: Robot, filter: AbstractFilter
-) -> _ImuRows | None:
+) -> SensorRows | None:
     """Return the rows while all feet stand; None if that is too short."""
     if len(robot.contacts) < 3:
         return None
@@ -237,6 +166,7 @@ def _imu_rows(
     step = max(1, int(SETTINGS.max_step / sample_time))
     row_time = step * sample_time
     parts = []
+    blocks = 0
     for a, b in contact_grid(recording, robot).segments:
         rows = slice(edge, b - a - edge, step)
         is_long = (b - a - 2 * edge) * sample_time > SETTINGS.block_time
@@ -245,19 +175,23 @@ def _imu_rows(
         joints = filter.motion(q[a:b], None, sample_time)[rows]
         smooth = filter.motion(measured[a:b], None, sample_time).q[rows]
         known, columns = _motion_of_legs(robot, joints, row_time)
-        numbers = np.arange(len(smooth)) * row_time // SETTINGS.block_time
+        times = np.arange(len(smooth)) * row_time
+        numbers = blocks + (times // SETTINGS.block_time).astype(int)
+        blocks = numbers[-1] + 1
         parts.append((smooth.reshape(-1, 2, 3), known, columns, numbers))
     if sum(len(part[0]) for part in parts) * row_time < SETTINGS.min_time:
         return None
     measured, known, columns, numbers = map(np.concatenate, zip(*parts, strict=True))
-    blocks = np.cumsum(np.diff(numbers, prepend=0.0) != 0)
-    return _ImuRows(measured, known, columns, blocks)
+    return SensorRows(measured, known, columns, PRIOR, numbers)
 
 
 def _motion_of_legs(
     robot: Robot, joints: Motion, row_time: float
 ) -> tuple[np.ndarray, np.ndarray]:
-    """Return `known` and `columns` of rows that are one after the other."""
+    """Return what an IMU as described measures in rows that are one after the other.
+
+    Columns of its displacement in the base, and of its two biases, are beside it.
+    """
     twist, up = _base_twist(robot, joints)
     velocity = twist[:, :3]
     rates = twist[:, 3:]
@@ -285,17 +219,9 @@ def _base_twist(robot: Robot, joints: Motion) -> tuple[np.ndarray, np.ndarray]:
     """
     angles = np.zeros((len(joints.q), robot.joints))
     angles[:, list(robot.driven)] = joints.q
-    order = np.argsort(robot.order)
-    feet = [
-        tip_jacobian(robot.replace(tip_body=x.body, tip_offset=x.position), angles)
-        for x in robot.contacts
-    ]
+    feet = contact_tips(robot, angles)
     up = plane_normal(np.stack([foot.position for foot in feet], axis=1))
-    slopes = [
-        contact.shape.jacobian(foot.velocity[:, order], foot.turn[:, order], up)
-        for contact, foot in zip(robot.contacts, feet, strict=True)
-    ]
-    slopes = np.concatenate(slopes, axis=2)
+    slopes = np.concatenate(contact_jacobians(robot, feet, up), axis=2)
     by_joints = np.einsum("njf,nj->nf", slopes[:, list(robot.driven)], joints.qd)
     by_base = np.moveaxis(slopes[:, :GROUP], 1, 2)
     twist = -np.einsum("nif,nf->ni", np.linalg.pinv(by_base), by_joints)

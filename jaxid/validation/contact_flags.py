@@ -33,7 +33,7 @@ from jaxid.measurement.imu_offset import (
 )
 from jaxid.measurement.observations import observe
 from jaxid.measurement.recording import Recording
-from jaxid.result_table import Remark, Status, significant
+from jaxid.result_table import Remark, Status, percent, significant
 from jaxid.robot.contacts import legs_of
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot
@@ -55,8 +55,10 @@ class ContactLimits(NamedTuple):
     unexplained: float = 0.15  # the same, in a fit with the flags as they are
     duration: float = 0.2  # shortest stretch that is judged [s]
     gravity: float = 0.05  # deviation of the mean acceleration, relative
+    vertical_bias: float = 0.04  # the same [m/s²]; gravity on Earth differs by 0.03
     mass: float = 0.02  # effect of a mass at a lifted foot, over that in the trunk
-    # rotation [rad], displacement [m] and biases of an IMU [rad/s, m/s²] that are usual
+    # rotation [rad], displacement [m] and biases of an IMU [rad/s, m/s²] that are
+    # usual: norms of what intervals leave of the three axes
     imu: tuple[float, ...] = (np.deg2rad(1.0), 0.03, 0.02, 0.05)
     turn: float = np.deg2rad(10.0)  # rotation that spoils any fit [rad]
     slip: float = 2.0  # error of feet that slip, over half of the 95 % interval
@@ -279,7 +281,17 @@ def imu_remarks(
             )
         return [Remark(text, Status.BAD)]
     offset = identify_imu_offset(recording, robot, filter)
-    return [] if offset is None else _offset_remarks(offset)
+    remarks = [] if offset is None else _offset_remarks(offset)
+    if remarks or abs(gravity - STANDARD_GRAVITY) <= LIMITS.vertical_bias:
+        return remarks
+    share = percent(abs(gravity / STANDARD_GRAVITY - 1.0), 1)
+    text = (
+        f"the accelerometer measures {gravity:.2f} m/s² along the vertical, but "
+        "gravity is 9.78 to 9.83 m/s²: its bias or scale makes all masses wrong by "
+        f"{share} %; give `imu_offset = true` in `[recording]`, which removes a bias, "
+        "or calibrate the sensor."
+    )
+    return [Remark(text, Status.DOUBTFUL)]
 
 
 def _offset_remarks(offset: ImuOffset) -> list[Remark]:
@@ -304,7 +316,7 @@ def _offset_remarks(offset: ImuOffset) -> list[Remark]:
         f"has an accelerometer with a bias of {significant(acceleration, 2)} m/s² (or "
         f"the ground slopes by {slope:.1f} degrees)",
     )
-    is_large = certain_sizes.max(axis=1) > LIMITS.imu
+    is_large = np.linalg.norm(known_values, axis=1) > LIMITS.imu
     faults = [text for text, is_fault in zip(words, is_large, strict=True) if is_fault]
     if not faults:
         return []

@@ -32,7 +32,7 @@ from .clock import clock_finding, held_forces
 from .limit_checks import LogStatistics, limit_findings
 from .mistake_search import find_mistakes, ignore_progress
 from .sensor_checks import channel_findings, constant_forces, repeated_channels
-from .wrench_checks import base_wrench_remarks
+from .wrench_checks import wrench_remarks
 
 MAX_SAMPLES = 2**17
 """Largest number of samples of a long log that are examined."""
@@ -335,7 +335,7 @@ def _mistakes_in_base_wrenches(
     doubts = []
     for log in logs:
         name = f"{log.name}: " if len(logs) > 1 else ""
-        for remark in base_wrench_remarks(model, log):
+        for remark in wrench_remarks(model, log):
             texts = certain if remark.status is Status.BAD else doubts
             texts.append(f"{name}{remark.text}")
     return LogMistakes(tuple(certain), tuple(doubts))

@@ -151,7 +151,7 @@ def sensor_logs(
         logs.append(log)
         remarks += [
             dataclasses.replace(x, text=f"{recording.name}: {x.text}")
-            for x in wrench_remarks(robot, log)
+            for x in wrench_remarks(base.model, log)
         ]
         if recording.forces is not None:
             of_joints = dataclasses.replace(recording, wrench=None)

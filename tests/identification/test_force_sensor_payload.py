@@ -112,7 +112,8 @@ def test_refusals(time):
 def findings(time, measured):
     robot = ROBOT.with_sensor()
     log = jid.Recording.of(poses(time, 1.0), None, wrench=measured, sample_time=0.01)
-    return wrench_remarks(robot, jid.observe(log, robot, *OPTIONS))
+    model = jid.Model(robot, (SensorLoad(),))
+    return wrench_remarks(model, jid.observe(log, robot, *OPTIONS))
 
 
 def attitudes(time):
