@@ -39,10 +39,12 @@ def contact_jacobians(
     """
     # Joints in the order of their numbers.
     order = np.argsort(robot.order)
-    return [
-        contact.shape.jacobian(tip.velocity[:, order], tip.turn[:, order], up)
-        for contact, tip in zip(robot.contacts, tips, strict=True)
-    ]
+    jacobians = []
+    for contact, tip in zip(robot.contacts, tips, strict=True):
+        velocity = tip.velocity[:, order]
+        turn = tip.turn[:, order]
+        jacobians.append(contact.shape.jacobian(velocity, turn, up))
+    return jacobians
 
 
 def elimination(

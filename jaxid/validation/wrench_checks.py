@@ -182,7 +182,7 @@ def _base_remarks(
     if distance > LIMITS.distance:
         origin = np.asarray(robot.offset)[0] + attitude @ displacement
         numbers = ", ".join(f"{x:.3f}" for x in origin)
-        length = significant(1e3 * np.linalg.norm(displacement), 2)
+        length = significant(float(1e3 * np.linalg.norm(displacement)), 2)
         text = (
             f"the sensor is displaced by {length} mm against its description: its "
             f"origin is about [{numbers}] m. Give it as `position` in `[sensor]`."
