@@ -63,9 +63,11 @@ def elimination(
     """
     legs = legs_of(robot)
     matrices = []
-    jacobians = contact_jacobians(robot, contact_tips(robot, q), up)
+    tips = contact_tips(robot, q)
+    jacobians = contact_jacobians(robot, tips, up)
     for number, jacobian in enumerate(jacobians):
-        force_of_leg = np.linalg.pinv(jacobian[:, list(legs.own_joints[number])])
+        own_joints = list(legs.own_joints[number])
+        force_of_leg = np.linalg.pinv(jacobian[:, own_joints])
         X = jacobian[:, list(legs.rows)] @ force_of_leg
         matrices.append(np.where(stands[:, number, None, None], X, 0.0))
     return np.concatenate(matrices, axis=2).reshape(len(q), -1)

@@ -220,9 +220,12 @@ def _base_twist(robot: Robot, joints: Motion) -> tuple[np.ndarray, np.ndarray]:
     angles = np.zeros((len(joints.q), robot.joints))
     angles[:, list(robot.driven)] = joints.q
     feet = contact_tips(robot, angles)
-    up = plane_normal(np.stack([foot.position for foot in feet], axis=1))
-    slopes = np.concatenate(contact_jacobians(robot, feet, up), axis=2)
-    by_joints = np.einsum("njf,nj->nf", slopes[:, list(robot.driven)], joints.qd)
+    positions = np.stack([foot.position for foot in feet], axis=1)
+    up = plane_normal(positions)
+    jacobians = contact_jacobians(robot, feet, up)
+    slopes = np.concatenate(jacobians, axis=2)
+    by_driven = slopes[:, list(robot.driven)]
+    by_joints = np.einsum("njf,nj->nf", by_driven, joints.qd)
     by_base = np.moveaxis(slopes[:, :GROUP], 1, 2)
     twist = -np.einsum("nif,nf->ni", np.linalg.pinv(by_base), by_joints)
     return twist, up

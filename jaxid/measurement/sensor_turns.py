@@ -101,15 +101,20 @@ class SensorRows(NamedTuple):
         # Entry (i, j) of the turn brings axis j of the sensor to axis i.
         axes = np.einsum("ai,nbj->nbaij", np.eye(3), self.measured)
         entries = axes.reshape(-1, 9)
-        sides = np.column_stack([entries, -self.known.ravel()]) * weights
-        A = self.columns.reshape(len(sides), -1) * weights
+        sides = np.column_stack([entries, -self.known.ravel()])
+        sides = sides * weights
+        A = self.columns.reshape(len(sides), -1)
+        A = A * weights
         A = np.vstack([A, np.diag(self.prior)])
-        sides = np.vstack([sides, np.zeros((len(self.prior), 10))])
+        zeros = np.zeros((len(self.prior), 10))
+        sides = np.vstack([sides, zeros])
         solution, *_ = np.linalg.lstsq(A, sides, rcond=SETTINGS.rank)
-        R = np.linalg.qr(sides - A @ solution, mode="r")
+        remainders = sides - A @ solution
+        R = np.linalg.qr(remainders, mode="r")
         # A turn that nothing determines must not follow rounding.
         is_rounding = np.abs(R) < SETTINGS.rounding * np.linalg.norm(sides)
-        return _TurnedVectors(solution, np.where(is_rounding, 0.0, R))
+        R = np.where(is_rounding, 0.0, R)
+        return _TurnedVectors(solution, R)
 
     def _remainders(self, turn: Matrix3, unknowns: Vector) -> Vectors:
         """Return what is unexplained of turned vectors."""
@@ -131,14 +136,17 @@ class SensorRows(NamedTuple):
         slopes = slopes / errors[:, None, None]
         remainders = self._remainders(turn, unknowns) / errors[:, None]
         gradients = np.einsum("nbai,nba->ni", slopes, remainders)
-        sums = np.zeros((self.blocks.max() + 1, gradients.shape[1]))
+        blocks = self.blocks.max() + 1
+        sums = np.zeros((blocks, gradients.shape[1]))
         np.add.at(sums, self.blocks, gradients)
 
         prior = np.diag(np.append(np.zeros(3), self.prior**2))
-        information = np.einsum("nbai,nbaj->ij", slopes, slopes) + prior
-        rank = SETTINGS.rank**2
-        inverse = np.linalg.pinv(information, rcond=rank, hermitian=True)
-        return inverse @ (sums.T @ sums + prior) @ inverse
+        products = np.einsum("nbai,nbaj->ij", slopes, slopes)
+        inverse = np.linalg.pinv(
+            products + prior, rcond=SETTINGS.rank**2, hermitian=True
+        )
+        variation = sums.T @ sums + prior
+        return inverse @ variation @ inverse
 
 
 class _TurnedVectors(NamedTuple):
