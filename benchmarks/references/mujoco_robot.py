@@ -46,7 +46,7 @@ class MujocoRobot(jid.VirtualRobot):
         specification.option.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         model = specification.compile()
         for name, damping in zip(
-            self.robot.joint_names, self.present_friction.viscous, strict=True
+            self.robot.joint_names, self.friction.viscous, strict=True
         ):
             model.dof_damping[model.joint(name).dofadr[0]] = damping
         return MujocoPlant(model, self.robot.joint_names)
@@ -56,7 +56,7 @@ class MujocoRobot(jid.VirtualRobot):
         import mujoco
 
         robot = self.robot
-        dry_friction = np.asarray(self.present_friction.coulomb)
+        dry_friction = np.asarray(self.friction.coulomb)
         rotors = np.diagonal(self._drive_inertia())
         kinds = (mujoco.mjtJoint.mjJNT_SLIDE, mujoco.mjtJoint.mjJNT_HINGE)
         specification = mujoco.MjSpec()

@@ -196,24 +196,24 @@ class LuGreFriction(AbstractGearFriction):
 
 
 class FrictionTemperature(eqx.Module):
-    r"""Dependence of friction on the temperature of the gears (Sec. 6).
+    r"""Temperature of the gears, and how friction depends on it (Sec. 6).
 
-    Viscous friction is multiplied by $e^{-a (T - T_0)}$, the law of
+    From $T_0$ to $T$ viscous friction is multiplied by $e^{-a (T - T_0)}$, the law of
     `TemperatureScaled`, and dry friction by the same with its own rate.
 
     Attributes:
         viscous_rate: $a$ of the viscous friction [1/K].
         dry_rate: $a$ of the dry friction [1/K].
-        reference: Temperature $T_0$ at which the friction is known [°C].
+        temperature: Present temperature $T_0$ [°C].
     """
 
     viscous_rate: Joints
     dry_rate: Joints
-    reference: float = 20.0
+    temperature: Joints | float = 20.0
 
-    def factors(self, temperature: Joints) -> tuple[np.ndarray, np.ndarray]:
-        """Return the factors of viscous and dry friction at a temperature [°C]."""
-        rise = np.asarray(temperature) - self.reference
+    def factors(self, temperature: Joints | float) -> tuple[np.ndarray, np.ndarray]:
+        """Return the factors of viscous and dry friction at another temperature."""
+        rise = np.asarray(temperature) - self.temperature
         viscous_factors = np.exp(-self.viscous_rate * rise)
         dry_factors = np.exp(-self.dry_rate * rise)
         return viscous_factors, dry_factors

@@ -82,12 +82,11 @@ def virtual_tx90l_on_rail(
         ),
         ripple=TorqueRipple(0.01 * max_forces, np.full(7, 6.0), np.linspace(0, 6, 7)),
         heating=heating,
-        temperature=np.full(7, TEMPERATURES[warm]),
     )
-    if disturbed:
-        return virtual_robot
-    smooth_friction = SmoothFriction(friction.viscous, friction.coulomb)
-    return virtual_robot.replace(friction=smooth_friction, ripple=None)
+    if not disturbed:
+        smooth_friction = SmoothFriction(friction.viscous, friction.coulomb)
+        virtual_robot = virtual_robot.replace(friction=smooth_friction, ripple=None)
+    return virtual_robot.at(TEMPERATURES[warm])
 
 
 def _bodies(published: dict[int, float]):
@@ -136,6 +135,7 @@ def _friction(robot: Robot):
     heating = FrictionTemperature(
         viscous_rate=-np.log(viscous_factors) / rise,
         dry_rate=-np.log(dry_factors) / rise,
+        temperature=TEMPERATURES[0],
     )
     return friction, heating
 

@@ -171,11 +171,11 @@ class VirtualRobot(Hashable):
         robot: Known properties of the robot.
         terms: Equations of motion without friction.
         values: Parameters of these terms.
-        friction: Friction of the gears, at the reference temperature.
+        friction: Friction of the gears.
         sensors: Sensors of its logs.
         ripple: Ripple of the motor torques; none if None.
-        heating: Dependence of friction on temperature; none if None.
-        temperature: Temperatures of the gears [°C]; None without `heating`.
+        heating: Temperature of the gears, and how friction depends on it; None if it
+            does not.
     """
 
     robot: Robot
@@ -185,7 +185,6 @@ class VirtualRobot(Hashable):
     sensors: Sensors
     ripple: TorqueRipple | None = None
     heating: FrictionTemperature | None = None
-    temperature: Joints | None = None
 
     def __check_init__(self):
         size = self.bodies.size
@@ -194,22 +193,11 @@ class VirtualRobot(Hashable):
                 f"`values` must hold {size} numbers for `terms`, but has shape "
                 f"{self.values.shape}."
             )
-        if (self.temperature is None) != (self.heating is None):
-            raise InputError(
-                "`temperature` must be given with `heating`, and only with it."
-            )
 
     @property
     def bodies(self) -> Model:
         """Equations of motion without friction."""
         return Model(self.robot, self.terms)
-
-    @property
-    def present_friction(self) -> AbstractGearFriction:
-        """Friction of the gears at their temperature."""
-        if self.heating is None or self.temperature is None:
-            return self.friction
-        return self.friction.scaled(*self.heating.factors(self.temperature))
 
     @property
     def model(self) -> Model:
@@ -218,13 +206,11 @@ class VirtualRobot(Hashable):
 
     @property
     def parameters(self) -> np.ndarray:
-        """True standard parameters of `model` at the present temperature."""
+        """True standard parameters of `model`."""
         first_body, *other_bodies = (
             np.asarray(x) for _, x in self.bodies.split(self.values)
         )
-        return np.concatenate(
-            [first_body, self.present_friction.parameters, *other_bodies]
-        )
+        return np.concatenate([first_body, self.friction.parameters, *other_bodies])
 
     def replace(self, **fields: Any) -> "VirtualRobot":
         """Return a copy with some fields replaced, such as another friction."""
@@ -239,13 +225,19 @@ class VirtualRobot(Hashable):
         Raises:
             InputError: If friction does not depend on temperature.
         """
+        if self.heating is None:
+            raise InputError(
+                "`temperature` changes nothing here: give the robot `heating`."
+            )
+        viscous_factors, dry_factors = self.heating.factors(temperature)
         return self.replace(
-            temperature=np.full(self.robot.joints, temperature, np.float64)
+            friction=self.friction.scaled(viscous_factors, dry_factors),
+            heating=dataclasses.replace(self.heating, temperature=temperature),
         )
 
     def resistance(self, q: Joints, qd: Joints) -> Joints:
         """Return friction less ripple of one sample, at constant speeds [N m or N]."""
-        friction = self.present_friction.steady(qd)
+        friction = self.friction.steady(qd)
         if self.ripple is None:
             return friction
         return friction - self.ripple.forces(self.robot, q)
@@ -313,7 +305,7 @@ class VirtualRobot(Hashable):
 
         Its parts are `start`, `step` and `read`.
         """
-        friction = self.present_friction
+        friction = self.friction
         drives = DriveTrain(self.bodies, friction, self.ripple, step)
         return SimulatedPlant(drives, self.values)
 

@@ -38,10 +38,9 @@ def ur10(tool=False):
 def test_forces_of_a_motion_are_mujocos(virtual):
     virtual = virtual.replace(
         friction=SmoothFriction(
-            virtual.present_friction.viscous, 0.0 * virtual.friction.coulomb
+            virtual.friction.viscous, 0.0 * virtual.friction.coulomb
         ),
         heating=None,
-        temperature=None,
     )
     n = virtual.robot.joints
     motion = Motion(*np.random.default_rng(1).normal(size=(3, 50, n)))

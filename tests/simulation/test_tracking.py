@@ -112,9 +112,8 @@ REFUSALS = [
         "`feed_forward`",
         lambda v, m: v.track(m, feed_forward=lambda x: x.q[:, :3], seed=0),
     ),
-    ("`temperature`", lambda v, m: v.replace(temperature=None)),
     ("`values`", lambda v, m: v.replace(values=np.ones(3))),
-    ("`temperature`", lambda v, m: v.replace(heating=None, temperature=None).at(30.0)),
+    ("`temperature`", lambda v, m: v.replace(heating=None).at(30.0)),
     ("`servo`", lambda v, m: diverge(v, m)),
 ]
 
