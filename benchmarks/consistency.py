@@ -122,8 +122,6 @@ class Arm:
 
     def stressed(self, trial):
         """Return a data set and an estimator of a hard fit, in one of five ways."""
-        import numpy as np
-
         import jaxid as jid
 
         robot, way = self.model.robot, trial % 5
@@ -135,11 +133,7 @@ class Arm:
             )
         if way == 4:
             truth = self.truth(trial)[: 10 * robot.joints].reshape(-1, 10)
-            centre = truth[:, 1:4] / truth[:, :1]
-            bounds = bounds.replace(
-                mass_max=0.5 * truth[:, 0],
-                centre_max=np.minimum(centre - 0.01, 0.1 * bounds.radius[:, None]),
-            )
+            bounds = bounds.replace(mass_max=0.5 * truth[:, 0])
         noise, samples = (1.0 if way == 3 else 0.05), (10 if way == 2 else None)
         return self.factor(trial, noise, samples), jid.PhysicallyConsistent(
             bounds=bounds

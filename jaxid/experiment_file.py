@@ -189,8 +189,6 @@ KEYS: dict[str, TomlTable] = {
         "mass_max": np.ndarray,
         "radius": np.ndarray,
         "mass_min": np.ndarray,
-        "centre_min": np.ndarray,
-        "centre_max": np.ndarray,
         "total_mass": float,
     },
     "rollout": {

@@ -266,14 +266,12 @@ def test_estimators_of_files(load, tmp_path):
     assert [claims[k] for k in ("m1", "m2", "A2", "C2")] == [5.0, 7.0, 7.0, 6.0]
     bounds = """kind = "consistent"
 mass_min = 0.5
-centre_min = [[-0.2, -inf, -0.1], [-0.3, -0.1, -0.1]]
 total_mass = 12
 """
     consistent = load(robot + bounds).setup.estimator
     assert consistent.pull.bodies[1, 0] == 7.0
     assert consistent.bounds.total_mass == 12.0
     np.testing.assert_array_equal(consistent.bounds.mass_min, [0.5, 0.5])
-    np.testing.assert_array_equal(consistent.bounds.centre_min[:, 1], [-np.inf, -0.1])
 
 
 BODIES = '[estimator]\nkind = "consistent"\n'
@@ -331,7 +329,7 @@ REFUSALS = [
         '`estimator.pull`: belongs to `kind = "consistent"',
     ),
     (ARM + "[estimator]\nkind = 'instrumental'", "`estimator.kind` must be"),
-    (ARM + BODIES + "centre_max = [[1, 1, 1], [1, 1]]", "`estimator.centre_max`"),
+    (ARM + BODIES + "radius = [[1, 1, 1], [1, 1]]", "`estimator.radius`"),
     (ARM + "[estimator]\nridge = 'cv'", "`estimator.ridge`"),
     ("[robot\n", "TOML"),
     (ARM + "x = " + 3000 * "[", "TOML"),

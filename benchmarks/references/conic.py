@@ -44,11 +44,6 @@ def problem(
             m >= bounds.mass_min[k],
             L**2 * m >= (A + B + C) / 2,
         ]
-        for axis in range(3):
-            if np.isfinite(bounds.centre_min[k, axis]):
-                constraints.append(h[axis] >= bounds.centre_min[k, axis] * m)
-            if np.isfinite(bounds.centre_max[k, axis]):
-                constraints.append(h[axis] <= bounds.centre_max[k, axis] * m)
     drives = list(feasible.drives)
     constraints += [y[drives] >= 0, y[drives] <= 1]
     for coupling in feasible.couplings:

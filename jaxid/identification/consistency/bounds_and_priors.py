@@ -14,8 +14,6 @@ from .pseudo_inertia import consistency_margin
 
 OfBodies = Float[np.ndarray, " bodies"]
 """A number for each body."""
-Points = Float[np.ndarray, "bodies 3"]
-"""A point in the frame of each body [m]."""
 
 MASS_PER_SQUARED_REACH = 100.0
 """Largest mass of a body, relative to the square of the robot's reach [kg/m²]."""
@@ -26,7 +24,7 @@ WEAK_PULL = 1.0
 
 
 class BodyBounds(eqx.Module):
-    """Bounds of masses, sizes and centres of mass.
+    """Bounds of masses and sizes.
 
     Without them the best masses are infinite.
 
@@ -35,29 +33,21 @@ class BodyBounds(eqx.Module):
         radius: Radius of the sphere about the origin of each body's frame that contains
             the body [m], like `0.6`.
         mass_min: Smallest mass of each body [kg], like `0.5`.
-        centre_min: Lower corners of boxes for the centres of mass [m], like `[-0.2,
-            -0.2, 0.0]`; -inf for none.
-        centre_max: Upper corners [m], like `[0.2, 0.2, 0.5]`; inf for none.
         total_mass: Mass of all bodies together [kg], like `120.0`; None if unknown.
     """
 
     mass_max: OfBodies = eqx.field(converter=given)
     radius: OfBodies = eqx.field(converter=given)
     mass_min: OfBodies = eqx.field(converter=given, default=0.0)
-    centre_min: Points = eqx.field(converter=given, default=-np.inf)
-    centre_max: Points = eqx.field(converter=given, default=np.inf)
     total_mass: float | None = eqx.field(converter=optional, default=None)
 
     def __post_init__(self):
         bodies = max(np.size(self.mass_max), np.size(self.radius))
         for name in ("mass_max", "radius", "mass_min"):
             setattr(self, name, _of_each_body(name, getattr(self, name), bodies))
-        for name in ("centre_min", "centre_max"):
-            setattr(self, name, _of_each_body(name, getattr(self, name), bodies, 3))
         mass_min = self.mass_min
         mass_max = self.mass_max
         radius = self.radius
-        is_box = self.centre_min < self.centre_max
         self._require(
             "mass_max", "positive and finite", (mass_max > 0) & (mass_max < np.inf)
         )
@@ -67,15 +57,12 @@ class BodyBounds(eqx.Module):
             "at least 0 and below `mass_max`",
             (mass_min >= 0) & (mass_min < mass_max),
         )
-        self._require("centre_min", "below `centre_max`", is_box)
         total = self.total_mass
         if total is not None and not mass_min.sum() < total < mass_max.sum():
             raise InputError(
                 f"`total_mass` must be from {mass_min.sum():g} "
                 f"to {mass_max.sum():g} kg, but is {total:g} kg."
             )
-        # Bounds that contradict each other are an error here, not in the estimation.
-        _ = self.inner_centres
 
     def _require(self, name: str, rule: str, is_good: np.ndarray) -> None:
         """Check the rule of a field, and name the first body that breaks it."""
@@ -118,7 +105,7 @@ class BodyBounds(eqx.Module):
         """Return a copy with some bounds replaced; scalars count for all bodies.
 
         Raises:
-            InputError: If shapes do not fit, or no body satisfies all bounds.
+            InputError: If shapes do not fit, or bounds contradict each other.
         """
         return dataclasses.replace(self, **fields)
 
@@ -129,39 +116,9 @@ class BodyBounds(eqx.Module):
         ]
         if np.any(self.mass_min):
             parts.append(f"masses from {_span(self.mass_min)} kg")
-        if np.isfinite([self.centre_min, self.centre_max]).any():
-            parts.append("centres of mass in boxes")
         if self.total_mass is not None:
             parts.append(f"{self.total_mass:.4g} kg together")
         return ", ".join(parts)
-
-    @property
-    def inner_centres(self) -> np.ndarray:
-        """Centres of mass well inside all bounds [m].
-
-        Raises:
-            InputError: If there are none for some body.
-        """
-        radius = self.radius[:, None]
-        lower_corner = np.maximum(self.centre_min, -radius)
-        upper_corner = np.minimum(self.centre_max, radius)
-        edge = 0.1 * (upper_corner - lower_corner)
-        point = 0.5 * (lower_corner + upper_corner)
-        # Alternating projections onto the sphere and the box, each a little smaller.
-        for _ in range(200):
-            distance = np.linalg.norm(point / radius, axis=1, keepdims=True)
-            point = point / np.maximum(distance / 0.9, 1.0)
-            point = np.clip(point, lower_corner + edge, upper_corner - edge)
-
-        is_in_box = ((lower_corner < point) & (point < upper_corner)).all(axis=1)
-        is_in_sphere = np.linalg.norm(point / radius, axis=1) < 0.99
-        is_inside = is_in_box & is_in_sphere
-        if not is_inside.all():
-            body = int(np.argmin(is_inside))
-            raise InputError(
-                f"no centre of mass of body {body + 1} fits its bounds: widen them."
-            )
-        return point
 
 
 def _span(values) -> str:
@@ -171,15 +128,15 @@ def _span(values) -> str:
     return maximum if np.ptp(values) == 0 else f"{minimum} to {maximum}"
 
 
-def _of_each_body(name: str, value: Numbers, bodies: int, *shape: int) -> np.ndarray:
+def _of_each_body(name: str, value: Numbers, bodies: int) -> np.ndarray:
     """Return numbers of each body, from numbers for each or for all."""
     array = np.array(value, np.float64)
-    if np.isnan(array).any() or array.shape not in ((), shape, (bodies, *shape)):
+    if np.isnan(array).any() or array.shape not in ((), (bodies,)):
         raise InputError(
             f"`{name}` must be one for all bodies, or one for each of {bodies}, but is "
             f"{value}."
         )
-    return np.broadcast_to(array, (bodies, *shape)).copy()
+    return np.broadcast_to(array, (bodies,)).copy()
 
 
 class EntropicPull(eqx.Module):

@@ -256,11 +256,10 @@ def _start(feasible: FeasibleSet, A, b, prior):
 
 def _unit_balls(bounds: BodyBounds) -> AnyArray:
     """Return the parameters of a ball of mass one in a unit sphere for each body."""
-    centre = bounds.inner_centres / bounds.radius[:, None]
-    # Half of the second moment that the sphere leaves; that of a ball is 3/5 m r².
-    variance = 0.5 * (1.0 - np.sum(centre**2, axis=1))
-    radius = np.sqrt(variance * 5.0 / 3.0)
-    return inertial_parameters(ball(np.ones(len(centre)), centre, radius))
+    bodies = len(bounds.radius)
+    # Half of the second moment that the sphere allows; that of a ball is 3/5 m r².
+    radius = np.full(bodies, np.sqrt(0.5 * 5.0 / 3.0))
+    return inertial_parameters(ball(np.ones(bodies), radius))
 
 
 def _move_to_prior(feasible: FeasibleSet, bodies, prior):

@@ -1,6 +1,5 @@
 """Feasible parameters: possible bodies, friction that brakes, rotors with inertia."""
 
-import itertools
 from collections.abc import Iterator
 from typing import NamedTuple
 
@@ -10,7 +9,6 @@ import scipy
 from jaxid.arrays import Indices, namespace
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
-from jaxid.robot.inertia import AXES
 
 from .bounds_and_priors import BodyBounds
 from .pseudo_inertia import Values, ball
@@ -131,16 +129,6 @@ class FeasibleSet(NamedTuple):
             names.append("smallest mass")
             rows.append(mass)
             offsets.append(-bounds.mass_min / bounds.mass_max)
-        sides = (("lower", 1.0, bounds.centre_min), ("upper", -1.0, bounds.centre_max))
-        for (side, sign, corners), axis in itertools.product(sides, range(3)):
-            is_bounded = np.isfinite(corners[:, axis])
-            if is_bounded.any():
-                corner = np.where(is_bounded, corners[:, axis], 0.0)
-                scaled_corner = corner / bounds.radius
-                row = sign * (unit[1 + axis] - scaled_corner[:, None] * mass)
-                names.append(f"{side} {AXES[axis]} of the centre of mass")
-                rows.append(np.where(is_bounded[:, None], row, 0.0))
-                offsets.append(np.where(is_bounded, 0.0, 1.0))
         return LinearBounds(names, np.stack(rows, axis=1), np.stack(offsets, axis=1))
 
 
@@ -179,10 +167,7 @@ def nominal_bodies(bounds: BodyBounds) -> np.ndarray:
     max_mass = bounds.mass_max
     medium_mass = min_mass + MEDIUM_MASS * (max_mass - min_mass)
     mass = np.clip(MEDIUM_MASS * max_mass, medium_mass, max_mass)
-    centre = bounds.inner_centres
-    # Half as large as the room that the sphere leaves around the centre.
-    distance = np.sum((centre / bounds.radius[:, None]) ** 2, axis=1)
-    return ball(mass, centre, 0.5 * bounds.radius * np.sqrt(1.0 - distance))
+    return ball(mass, 0.5 * bounds.radius)
 
 
 def _couplings(model: Model) -> Iterator[Coupling]:

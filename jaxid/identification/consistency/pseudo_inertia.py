@@ -69,14 +69,11 @@ def inertial_parameters(pseudo: PseudoInertias) -> Bodies:
     return namespace(pseudo).stack(parameters, axis=-1)
 
 
-def ball(mass: np.ndarray, centre: np.ndarray, radius: np.ndarray) -> np.ndarray:
-    """Return the pseudo-inertias [*batch, 4, 4] of solid balls [kg, m]."""
-    P = np.empty((*mass.shape, 4, 4))
+def ball(mass: np.ndarray, radius: np.ndarray) -> np.ndarray:
+    """Return the pseudo-inertias [*batch, 4, 4] of balls about the origin [kg, m]."""
+    P = np.zeros((*mass.shape, 4, 4))
     # The second moment of a ball about its centre is m r² / 5 in each direction.
     P[..., :3, :3] = radius[..., None, None] ** 2 / 5.0 * np.eye(3)
-    P[..., :3, :3] += centre[..., :, None] * centre[..., None, :]
-    P[..., :3, 3] = centre
-    P[..., 3, :3] = centre
     P[..., 3, 3] = 1.0
     return P * mass[..., None, None]
 

@@ -5,15 +5,21 @@ import pytest
 
 import jaxid as jid
 from jaxid.identification.consistency.pseudo_inertia import (
-    ball,
     consistency_margin,
     inertial_parameters,
 )
 
 BOUNDS = jid.consistency.BodyBounds(mass_max=10.0, radius=0.5)
-BODY = inertial_parameters(
-    ball(np.array(3.0), np.array([0.0, 0.1, 0.2]), np.array(0.12))
-)
+
+
+def ball(mass, centre, radius):
+    """Return the pseudo-inertia of a ball, by integrals over its volume."""
+    second_moments = radius**2 / 5 * np.eye(3) + np.outer(centre, centre)
+    centre = np.array(centre)[:, None]
+    return mass * np.block([[second_moments, centre], [centre.T, np.eye(1)]])
+
+
+BODY = inertial_parameters(ball(3.0, [0.0, 0.1, 0.2], 0.12))
 
 
 def test_it_is_the_integral_of_points():
@@ -35,7 +41,7 @@ def test_the_order_is_that_of_tools():
         0, mass=2.0, centre_of_mass=(0.1, -0.2, 0.3), inertia=0.08 * np.eye(3)
     )
     radius = np.sqrt(0.08 / 2.0 * 5 / 2)
-    P = ball(np.array(2.0), np.array([0.1, -0.2, 0.3]), np.array(radius))
+    P = ball(2.0, [0.1, -0.2, 0.3], radius)
     np.testing.assert_allclose(
         jid.consistency.pseudo_inertia(tool.parameters), P, rtol=1e-12
     )

@@ -34,8 +34,6 @@ CASES = {
         PLANAR,
         mass_min=1.0,
         mass_max=[30.0, 9.0],
-        centre_min=[0.0, -0.1, -np.inf],
-        centre_max=[0.4, 0.2, 0.3],
         total_mass=12.0,
     ),
 }
