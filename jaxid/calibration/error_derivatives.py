@@ -94,7 +94,7 @@ class PoseErrors(NamedTuple):
 
 def corrected_robot(robot: Robot, origins: Float[np.ndarray, "bodies 6"]) -> Robot:
     """Return the robot with shifted and turned origins of its joints."""
-    frames = Frame(np.asarray(robot.rotation), np.asarray(robot.offset))
+    frames = Frame(robot.rotation, robot.offset)
     frames = frames.corrected(origins)
     return robot.replace(offset=frames.position, rotation=frames.rotation)
 
@@ -161,7 +161,7 @@ def _unknown_motions(
     robot: Robot, unknowns: Unknowns
 ) -> Float[np.ndarray, "bodies 6 7"]:
     """Return shifts and turns of bodies' frames by their corrections and joints."""
-    axes = np.asarray(robot.axis)
+    axes = robot.axis
     turns = np.array(robot.turns)[:, None]
     screws = np.concatenate([np.where(turns, 0.0, axes), turns * axes], axis=1)
     rates = correction_rates(unknowns.origins)

@@ -156,7 +156,7 @@ class ModelSearch:
         self._masks = [log.mask for log in logs]
         # Until constants of friction are found, those of the file are near enough.
         estimate = setup.least_squares(RegressionProblem(setup.base, logs))
-        self._bodies = setup.base.to_standard(np.asarray(estimate.parameters))
+        self._bodies = setup.base.to_standard(estimate.parameters)
         self._transition = dry_transition(setup.model.terms)
         self._effects = self._effects_of_robot()
         self._begin_round()
@@ -252,9 +252,9 @@ class ModelSearch:
         base = find_friction_constants(base_parameters(self._model()), logs)
         problem = RegressionProblem(base, logs, divisions=DIVISIONS)
         estimate = setup.least_squares(problem)
-        self._bodies = base.to_standard(np.asarray(estimate.parameters))
+        self._bodies = base.to_standard(estimate.parameters)
         self._transition = dry_transition(base.model.terms)
-        return problem, np.asarray(estimate.weights)
+        return problem, estimate.weights
 
     def try_change(self, name: str) -> list[Trial]:
         """Return the errors with a further change; nothing if it does not go along."""
@@ -346,7 +346,7 @@ class ModelSearch:
         for log, row_parts in zip(logs, self.parts.rows, strict=True):
             is_late = self._is_late[row_parts]
             for half, is_inside in zip(halves, (~is_late, is_late), strict=True):
-                mask = np.asarray(log.mask) & is_inside[:, None]
+                mask = log.mask & is_inside[:, None]
                 if mask.any(axis=0).all():
                     half.append(log.replace(mask=mask))
         return halves

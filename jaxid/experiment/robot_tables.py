@@ -235,7 +235,7 @@ def require_gears(robot: Robot, columns: Columns) -> None:
     """Reject logs of motors without the gear ratios that the robot's file states."""
     is_of_motors = columns.angles_on_motor_side or columns.forces_on_motor_side
     if is_of_motors and robot.drives.lack_stated_ratios:
-        ratios = np.asarray(robot.drives.stated_ratios).tolist()
+        ratios = robot.drives.stated_ratios.tolist()
         raise InputError(
             "`recording.side` or `forces_side` says that the log was recorded on the "
             "motor side, but the gear ratios are 1, while the robot's file states "

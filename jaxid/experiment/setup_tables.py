@@ -73,7 +73,7 @@ class DryFriction:
             steady_transition = steady_friction.transition(robot)
             motors = None
             if terms.CoupledDrives().couplings(robot):
-                ratios = np.asarray(robot.drives.reduction)
+                ratios = robot.drives.reduction
                 motors = ratios / np.diag(ratios)[:, None]
             return terms.Presliding(steady=steady_transition, motors=motors)
         if self.hard:
@@ -107,7 +107,7 @@ def _speeds(robot: Robot, name: str, value: float | list[float]) -> Vector:
         speeds = per_joint(name, value, len(joints), 0.0)
     else:
         speeds = np.full(len(joints), float(value))
-    max_speeds = np.minimum(np.asarray(robot.limits.velocity), MAX_SPEED)
+    max_speeds = np.minimum(robot.limits.velocity, MAX_SPEED)
     for j, speed in zip(joints, speeds, strict=True):
         if speed > max_speeds[j]:
             raise InputError(

@@ -45,7 +45,7 @@ def write_template(
     limits = {x: np.asarray(getattr(robot.limits, x)).tolist() for x in LIMITS}
     stated_ratios = None
     if robot.drives.lack_stated_ratios:
-        stated_ratios = np.asarray(robot.drives.stated_ratios).tolist()
+        stated_ratios = robot.drives.stated_ratios.tolist()
     path = os.path.relpath(Path(urdf).resolve(), Path(folder).resolve())
     return fill_template(
         TEMPLATE,

@@ -301,8 +301,8 @@ def _as_run(result: Fit | HasRun | Run) -> Run:
         names=base.names,
         units=base.units,
         kinds=base.kinds,
-        parameters=np.asarray(fit.parameters),
-        covariance=np.asarray(fit.covariance),
+        parameters=fit.parameters,
+        covariance=fit.covariance,
         dof=float(np.median(fit.uncertainty.dof)),
         causes=_causes(fit),
     )
@@ -312,7 +312,7 @@ def _causes(fit: Fit) -> Mapping[str, Matrix]:
     """Return how a load, friction and gains would change the estimates of a fit."""
     base = fit.base
     unit_vectors = np.eye(base.size)
-    causes = {ALL_FORCES: np.asarray(fit.parameters)[:, None]}
+    causes = {ALL_FORCES: fit.parameters[:, None]}
     has_friction = ~stores_energy(base)
     if has_friction.any():
         causes[FRICTION] = unit_vectors[:, has_friction]

@@ -99,7 +99,7 @@ def with_unknown_delay(
     uncertainty = fit.uncertainty
     variances = np.diag(uncertainty.covariance)
     delay_variances = np.diag(delay_covariance)
-    dof = np.asarray(uncertainty.dof).copy()
+    dof = uncertainty.dof.copy()
     # Nothing is known of some parameters, with or without a delay.
     is_known = np.isfinite(variances)
     dof[is_known] = dof_of_sum(
@@ -132,7 +132,7 @@ def _derivative_by_delay(fit: Fit, problem: RegressionProblem) -> BaseVector:
         if len(chunk.forces) < 2:
             continue
         row_time = problem.recordings[chunk.recording].row_time
-        for joint, weight in enumerate(np.asarray(fit.weights)):
+        for joint, weight in enumerate(fit.weights):
             indices = list(chunk.indices[joint])
             columns = chunk.columns[joint]
             predicted_forces = columns @ fit.parameters[indices]

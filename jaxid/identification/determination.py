@@ -95,7 +95,7 @@ def random_rows(base: BaseParameters, parameters: AnyArray) -> Matrix:
     for j, columns in enumerate(base.acting_columns):
         rows[j][:, list(columns)] = joint_rows[j]
 
-    max_forces = np.asarray(robot.known_max_forces)[:, None]
+    max_forces = robot.known_max_forces[:, None]
     forces = rows @ np.asarray(parameters)
     is_possible = np.all(np.abs(forces) <= max_forces, axis=0)
     if np.count_nonzero(is_possible) >= MIN_SAMPLES:
@@ -117,12 +117,12 @@ def _random_motion(base: BaseParameters) -> Motion:
     limits = complete_limits(robot)
     rng = np.random.default_rng(0)
     shape = (SAMPLES, robot.joints)
-    low = np.asarray(limits.position_min)
-    high = np.asarray(limits.position_max)
+    low = limits.position_min
+    high = limits.position_max
     pace = rng.uniform(0.0, 1.0, (SAMPLES, 1))
     q = reachable(robot, rng.uniform(low, high, shape))
-    qd = pace * rng.uniform(-1.0, 1.0, shape) * np.asarray(limits.velocity)
-    qdd = pace**2 * rng.uniform(-1.0, 1.0, shape) * np.asarray(limits.acceleration)
+    qd = pace * rng.uniform(-1.0, 1.0, shape) * limits.velocity
+    qdd = pace**2 * rng.uniform(-1.0, 1.0, shape) * limits.acceleration
     if robot.floating:
         # Its accelerometer measures gravity as well.
         qdd[:, 2] += STANDARD_GRAVITY

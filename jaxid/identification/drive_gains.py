@@ -200,7 +200,7 @@ def _misfit(rows: "Rows", unknowns: np.ndarray) -> float:
 
 def _require_gains(robot: Robot) -> None:
     """Check that each motor turns its own axis, and that no tool is subtracted."""
-    reduction = np.asarray(robot.drives.reduction)
+    reduction = robot.drives.reduction
     if np.count_nonzero(reduction - np.diag(np.diag(reduction))):
         raise InputError(
             f"motors of `{robot.name}` turn more than one axis: they have no gains."

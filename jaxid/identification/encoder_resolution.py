@@ -24,7 +24,7 @@ MAX_NAMES = 4
 
 def encoder_steps(recording: Recording) -> Joints:
     """Return the step of each angle [rad or m]; zero for values on no grid."""
-    angles = np.asarray(recording.angles)
+    angles = recording.angles
     segments = [np.diff(angles[a:b], axis=0) for a, b in recording.segments]
     changes = np.abs(np.concatenate(segments))
     return np.array([_step(column) for column in changes.T])
@@ -61,13 +61,13 @@ def resolution_bias(
     motion = observations.motion
     # A log has the forces of a known tool in it.
     forces = fit.predict(motion) + fit.base.tool_forces(motion)
-    angles = np.asarray(motion.q)
+    angles = motion.q
     if recording.angles_on_motor_side:
-        angles = np.asarray(robot.drives.motor_angles(angles))
+        angles = robot.drives.motor_angles(angles)
     steps = encoder_steps(recording)
     grid = np.where(steps > 0, steps, 1.0)
     rounded_angles = np.where(steps > 0, np.round(angles / grid) * grid, angles)
-    estimator = WeightedLeastSquares(GivenWeights(np.asarray(fit.weights)))
+    estimator = WeightedLeastSquares(GivenWeights(fit.weights))
 
     def estimate(angles):
         log = dataclasses.replace(
@@ -79,7 +79,7 @@ def resolution_bias(
         )
         o = observe(log, robot, observations.filter, observations.decimation)
         o = o.replace(mask=observations.mask)
-        return np.asarray(estimator(RegressionProblem(fit.base, o)).parameters)
+        return estimator(RegressionProblem(fit.base, o)).parameters
 
     return estimate(rounded_angles) - estimate(angles)
 
@@ -92,7 +92,7 @@ def resolution_note(
     It is empty if there are none.
     """
     # Biases grow with the square of the steps: small ones cannot matter.
-    ranges = np.std(np.asarray(recording.angles), axis=0)
+    ranges = np.std(recording.angles, axis=0)
     is_coarse = encoder_steps(recording) > 1e-5 * ranges
     if recording.velocities is not None or not is_coarse.any():
         return ()

@@ -96,7 +96,7 @@ def row_chunks(
 
     Only some ranges of rows are made, or all.
     """
-    mask = np.asarray(observations.mask)
+    mask = observations.mask
     for chunk in observations.chunks(samples, ranges):
         motion, forces = observations.read(slice(*chunk.samples))
         forces = without_tool(base, motion, forces)
@@ -171,7 +171,7 @@ class Factors(eqx.Module):
     def weighted(self, weights: Joints) -> LinearSystem:
         r"""Return the system with the norms of $W \Theta_B p$, $W Q$ (Eq. 29)."""
         blocks = []
-        for joint, weight in zip(self.joints, np.asarray(weights), strict=True):
+        for joint, weight in zip(self.joints, weights, strict=True):
             block = np.zeros((len(joint.R), self.size + 1))
             block[:, [*joint.columns, -1]] = weight * joint.R
             blocks.append(block)

@@ -170,7 +170,7 @@ def choose_filter(
     base = identify_transition_speeds(base, rows.observations[usual_number])
     problems = [RegressionProblem(base, x) for x in rows.observations]
     # All candidates are judged with the same weights of the joints.
-    joint_weights = np.asarray(estimator(problems[usual_number]).weights) ** 2
+    joint_weights = estimator(problems[usual_number]).weights ** 2
 
     errors = []
     is_eligible = []
@@ -275,7 +275,7 @@ def _usual_candidate(cutoffs: Sequence[float]) -> int:
 
 def _highest_frequency(log: Observations) -> float:
     """Return the highest frequency of a motion [Hz], all joints taken together."""
-    velocities = np.asarray(log.motion.qd)
+    velocities = log.motion.qd
     frequency, power = scipy.signal.periodogram(
         velocities, 1.0 / log.sample_time, "hann", axis=0
     )
@@ -314,7 +314,7 @@ def _mask_ends(observations: Observations, edge: int) -> Observations:
     is_inside = np.zeros(len(instants), bool)
     for start, stop in observations.segments:
         is_inside |= (instants >= start + edge) & (instants < stop - edge)
-    mask = np.asarray(observations.mask) & is_inside[:, None]
+    mask = observations.mask & is_inside[:, None]
     return observations.replace(mask=mask)
 
 

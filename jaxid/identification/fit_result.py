@@ -9,16 +9,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import (
-    AnyArray,
-    BaseVector,
-    Float,
-    Indices,
-    Joints,
-    Matrix,
-    Texts,
-    Vector,
-)
+from jaxid.arrays import BaseMatrix, BaseVector, Indices, Matrix, Texts, Vector
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -107,12 +98,12 @@ class Fit(Summarised, eqx.Module):
     """
 
     base: BaseParameters
-    parameters: Float[AnyArray, " base"]
+    parameters: BaseVector
     uncertainty: Uncertainty
-    weights: Joints
+    weights: Vector
     condition_numbers: ConditionNumbers
     rows: Indices = eqx.field(static=True)
-    residual_rms: Joints
+    residual_rms: Vector
     residual: float
     undetermined: tuple[UndeterminedDirection, ...]
     estimator: AbstractEstimator
@@ -120,14 +111,14 @@ class Fit(Summarised, eqx.Module):
     recordings: Texts = eqx.field(static=True)
     notes: Texts = eqx.field(static=True)
     consistency: Consistency | None = None
-    full_parameters: Float[AnyArray, " standard"] | None = None
+    full_parameters: Vector | None = None
     residual_spectra: ResidualSpectra | None = None
     date: str = eqx.field(static=True, default="")
     blocks: Blocks | None = None
     name: str = eqx.field(static=True, default="")
 
     @property
-    def covariance(self) -> Float[AnyArray, "base base"]:
+    def covariance(self) -> BaseMatrix:
         """Covariance of the estimates; infinite variances where nothing is known."""
         return self.uncertainty.covariance
 
@@ -161,7 +152,7 @@ class Fit(Summarised, eqx.Module):
         lower_ends = self.parameters - half_widths
         return np.stack([lower_ends, self.parameters + half_widths], axis=1)
 
-    def draws(self, count: int, *, seed: int = 0) -> Float[AnyArray, "draws base"]:
+    def draws(self, count: int, *, seed: int = 0) -> Matrix:
         """Return random parameters, as likely as `covariance` and `intervals` say.
 
         A consistent estimate widens its intervals, but not these. Bodies of a draw can
@@ -184,7 +175,7 @@ class Fit(Summarised, eqx.Module):
             "expression": self.base.expressions,
             "unit": self.base.units,
             "group": self.base.kinds,
-            "estimate": np.asarray(self.parameters),
+            "estimate": self.parameters,
             "standard_deviation": self.standard_deviations,
             "open_share": self.open_shares,
             "low_95": intervals[:, 0],
@@ -269,7 +260,7 @@ class Fit(Summarised, eqx.Module):
         (`full_parameters`).
         """
         if self.full_parameters is not None:
-            return np.asarray(self.full_parameters)
+            return self.full_parameters
         return np.asarray(self.base.to_standard(self.parameters))
 
     @property

@@ -202,9 +202,7 @@ def naive_covariance(
     squares = factors.residual_squares(parameters)
     unknowns = inverse.shape[1]
     covariance = np.zeros((unknowns, unknowns))
-    for joint, weight, square in zip(
-        factors.joints, np.asarray(weights), squares, strict=True
-    ):
+    for joint, weight, square in zip(factors.joints, weights, squares, strict=True):
         variance = square / max(joint.rows * remaining_share, 1.0)
         columns = np.asarray(joint.R)[:, :-1]
         gain = weight**2 * columns @ inverse[list(joint.columns)]

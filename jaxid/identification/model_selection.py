@@ -251,7 +251,7 @@ def estimate_without_parts(
     for part in range(parts.size):
         training = problem.blocks.select(np.flatnonzero(parts.blocks != part))
         training_problem = RegressionProblem(problem.base, blocks=training)
-        estimates.append(np.asarray(estimator(training_problem).parameters))
+        estimates.append(estimator(training_problem).parameters)
     return np.array(estimates)
 
 
@@ -265,7 +265,7 @@ def predict_held_out(
     predictions = []
     for log in problem.recordings:
         measured_forces, errors = np.full((2, log.rows, log.joints), np.nan)
-        times = np.asarray(log.reduced_time)
+        times = log.reduced_time
         predictions.append(HeldOutPrediction(log.name, times, measured_forces, errors))
     for chunk in problem.chunks():
         prediction = predictions[chunk.recording]

@@ -252,8 +252,8 @@ def compare_some(
 ) -> Comparison:
     """Compare base parameters of two fits whose estimates have a cross-covariance."""
     k = list(indices)
-    first_covariance = np.asarray(first.covariance)[np.ix_(k, k)]
-    second_covariance = np.asarray(second.covariance)[np.ix_(k, k)]
+    first_covariance = first.covariance[np.ix_(k, k)]
+    second_covariance = second.covariance[np.ix_(k, k)]
     # Infinite variances make numbers that are none.
     with np.errstate(invalid="ignore", divide="ignore"):
         covariance = first_covariance + second_covariance - cross - cross.T

@@ -214,7 +214,7 @@ def block_edges(observations: Observations, blocks: int) -> list[int]:
 
     All blocks have equally many rows that count.
     """
-    rows = np.flatnonzero(np.asarray(observations.mask).any(axis=1))
+    rows = np.flatnonzero(observations.mask.any(axis=1))
     parts = [part for part in np.array_split(rows, blocks) if len(part)]
     return [0, *(int(part[0]) for part in parts[1:]), observations.rows]
 

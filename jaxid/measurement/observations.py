@@ -78,7 +78,7 @@ class Observations(eqx.Module):
     decimation: Subsample
     segments: Ranges = eqx.field(static=True)
     start_times: tuple[float, ...] = eqx.field(static=True)
-    mask: Bool[AnyArray, "rows joints"]
+    mask: Bool[np.ndarray, "rows joints"]
     sample_time: float = eqx.field(static=True)
     name: str = eqx.field(static=True, default="observations")
     notes: Texts = eqx.field(static=True, default=())
@@ -302,7 +302,7 @@ class Observations(eqx.Module):
         end_time = self.start_times[-1] + (b - a - 1) * self.sample_time
         middle_time = float(start_time + fraction * (end_time - start_time))
         is_early = self.reduced_time[:, None] < middle_time
-        mask = np.asarray(self.mask)
+        mask = self.mask
         first_part = self.replace(mask=mask & is_early)
         second_part = self.replace(mask=mask & ~is_early)
         has_rows = mask.any(axis=0)
@@ -483,7 +483,7 @@ def _speed_mask(
     masks = []
     for chunk in observations.chunks(65536):
         motion = observations.row_motion(slice(*chunk.rows))
-        masks.append(np.abs(np.asarray(motion.qd)) >= speeds)
+        masks.append(np.abs(motion.qd) >= speeds)
         if progress is not None:
             progress(chunk.rows[1] / observations.rows)
     return np.concatenate(masks)

@@ -44,7 +44,7 @@ def _comparison_panel(comparison: Comparison, shown: np.ndarray) -> Panel:
     """Return a row with two intervals for each parameter."""
     fits = (comparison.first, comparison.second)
     indices = np.array(comparison.indices)[shown]
-    estimates = np.stack([np.asarray(fit.parameters)[indices] for fit in fits])
+    estimates = np.stack([fit.parameters[indices] for fit in fits])
     half_widths = np.stack([fit.uncertainty.half_widths()[indices] for fit in fits])
     sizes = np.abs(estimates) + half_widths
     # An end at infinity is off the axis, whatever the scale.

@@ -39,10 +39,10 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
     grid = np.linspace(-1.0, 1.0, 81)
     speeds = np.outer(np.sign(grid) * grid**2, max_speeds)
     columns = _friction_columns(fit.base, speeds)
-    friction = columns @ np.asarray(fit.parameters)
+    friction = columns @ fit.parameters
     half_widths = _half_widths(fit, columns)
 
-    measured_speeds = np.concatenate([np.asarray(log.speeds) for log in logs])
+    measured_speeds = np.concatenate([log.speeds for log in logs])
     errors = np.concatenate([log.errors for log in logs])
     panels = []
     for j in robot.driven:
@@ -151,7 +151,7 @@ def error_scene(
 ) -> Figure:
     """Return the robot along a recording, coloured by its joints' torque errors."""
     robot = fit.base.model.robot
-    scale = np.asarray(log.max_forces)
+    scale = log.max_forces
     reference = "largest torque"
     if not np.isfinite(scale).all():
         scale = np.maximum(log.force_rms, np.finfo(float).tiny)
@@ -159,9 +159,9 @@ def error_scene(
     clouds = [(body, surface_points(shape)) for body, shape in shapes]
     return pose_figure(
         robot,
-        np.asarray(log.positions),
+        log.positions,
         title=f"{robot.name} along {log.name}",
-        time=np.asarray(log.time),
+        time=log.time,
         values=100.0 * log.errors / scale,
         label=f"torque error [% of {reference}]",
         # A hull needs four points.

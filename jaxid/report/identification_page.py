@@ -120,8 +120,8 @@ def _data(report: Report) -> Iterator[tuple[str, str]]:
 
 def _log_size(log: TorqueErrors) -> str:
     """Return the name of a log, and duration and number of the rows that count."""
-    counts_for_a_joint = np.asarray(log.counted).any(axis=1)
-    times = np.asarray(log.time)[counts_for_a_joint]
+    counts_for_a_joint = log.counted.any(axis=1)
+    times = log.time[counts_for_a_joint]
     duration = significant(float(times[-1] - times[0]))
     return f"{log.name}: {duration} s, {len(times)} rows"
 
@@ -198,7 +198,7 @@ def _details(report: Report, figures: Figures) -> Sections:
     yield "Task and notes", [Table("", facts=_settings_and_facts(report)), notes]
 
     summary = robot.summary()
-    gravity = ", ".join(f"{x:g}" for x in np.asarray(robot.gravity))
+    gravity = ", ".join(f"{x:g}" for x in robot.gravity)
     assumptions = ", ".join(robot.limits.assumed) or "nothing"
     facts = [*summary.facts, ("gravity [m/s²]", gravity), ("assumed", assumptions)]
     table = Table("", *summary.columns, facts=facts)
@@ -285,7 +285,7 @@ def body_table(
 
     Masses and centres are compared with those of the robot's file, if it has some.
     """
-    bodies = np.asarray(consistency.bodies)
+    bodies = consistency.bodies
     mass = bodies[:, 0]
     centre = bodies[:, 1:4] / mass[:, None]
     centre_columns = [

@@ -80,13 +80,13 @@ def write_inspection(
 def log_figure(robot: Robot, log: Recording) -> Figure:
     """Return angles and forces of a log, with the limits of the joints as lines."""
     limits = robot.limits
-    forces = np.asarray(robot.known_max_forces)
+    forces = robot.known_max_forces
     panels = []
     for j in range(robot.joints):
-        angle = Curve(log.time, np.asarray(log.angles)[:, j], "position", BLUE)
+        angle = Curve(log.time, log.angles[:, j], "position", BLUE)
         below = []
         if log.forces is not None:
-            force = Curve(log.time, np.asarray(log.forces)[:, j], "force", ORANGE)
+            force = Curve(log.time, log.forces[:, j], "force", ORANGE)
             levels = _lines(-forces[j], forces[j])
             below = [Panel([force], unit=robot.force_unit(j), levels=levels)]
         panels.append(

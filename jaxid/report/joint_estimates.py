@@ -89,7 +89,7 @@ def correlation_blocks(fit: Fit) -> list[Any]:
 
     The strongest come first.
     """
-    covariance = np.asarray(fit.covariance)
+    covariance = fit.covariance
     deviations = np.sqrt(np.diag(covariance))
     scale = np.outer(deviations, deviations)
     # Undetermined parameters have no correlation, and are in no pair.

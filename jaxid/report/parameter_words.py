@@ -47,7 +47,7 @@ def word_columns(base: BaseParameters) -> list[Column]:
 
     A star marks parameters that are combined with others.
     """
-    is_combined = np.any(np.asarray(base.kappa) != 0.0, axis=1)
+    is_combined = np.any(base.kappa != 0.0, axis=1)
     meanings = []
     places = []
     for name, needs_star in zip(base.names, is_combined, strict=True):

@@ -107,7 +107,7 @@ def tool_lines(payload: Payload, robot: Robot) -> list[str]:
     inertia = payload.inertia
     if payload.sensor is not None:
         # The body behind the sensor is in no file: the load is at the end-effector.
-        tip_rotation = np.asarray(robot.tip_rotation)
+        tip_rotation = robot.tip_rotation
         centre_of_mass = (centre_of_mass - robot.tip_offset) @ tip_rotation
         inertia = tip_rotation.T @ inertia @ tip_rotation
     centre = [f"{value:.6g}" for value in centre_of_mass]

@@ -32,12 +32,12 @@ def residual_figure(spectra: ResidualSpectra, robot: Robot) -> Figure:
 
 def _spectrum_panel(spectra: ResidualSpectra, robot: Robot, j: int) -> Panel:
     """Return the spectrum of a joint, and that of white noise behind the filters."""
-    frequency = np.asarray(spectra.frequency)
-    gain = np.asarray(spectra.gain)
+    frequency = spectra.frequency
+    gain = spectra.gain
     is_shown = (frequency > 0) & (gain > MIN_GAIN)
     frequency = frequency[is_shown]
     white_density = gain[is_shown] ** 2
-    density = np.asarray(spectra.density)[j, is_shown]
+    density = spectra.density[j, is_shown]
     white_level = np.sum(density) / np.sum(white_density)
 
     white_name = "random errors after the filters"

@@ -61,7 +61,7 @@ def torque_figure(
     """
     require_joints(errors, robot)
     joints = range(robot.joints) if joints is None else joints
-    rows = np.flatnonzero(np.asarray(errors.counted).any(axis=1))
+    rows = np.flatnonzero(errors.counted.any(axis=1))
     window = slice(rows[0], rows[-1] + 1)
     panels = [
         force_panel(
@@ -82,7 +82,7 @@ def model_force_figure(predictions: Predictions, robot: Robot, title: str) -> Fi
         robot: Robot of the log.
         title: Title of the figure.
     """
-    errors = np.asarray(next(iter(predictions.values())).errors)
+    errors = next(iter(predictions.values())).errors
     # Forces of some joints may not be measured.
     is_measured = np.isfinite(errors).any(axis=0)
     joints = np.flatnonzero(is_measured).tolist()
@@ -103,15 +103,15 @@ def force_panel(
     """Return the forces of a joint, with the errors of the models in a panel below."""
     unit = robot.force_unit(joint)
     log = next(iter(predictions.values()))
-    time = np.asarray(log.time)[rows]
-    measured_forces = np.asarray(log.measured)[rows, joint]
+    time = log.time[rows]
+    measured_forces = log.measured[rows, joint]
     curves = [Curve(time, measured_forces, "measured", MEASUREMENT_COLOUR, width=1.9)]
     error_curves = []
     for (name, prediction), colour in zip(
         predictions.items(), MODEL_COLOURS, strict=False
     ):
-        predicted_forces = np.asarray(prediction.predicted)[rows, joint]
-        errors = np.asarray(prediction.errors)[rows, joint]
+        predicted_forces = prediction.predicted[rows, joint]
+        errors = prediction.errors[rows, joint]
         curves.append(Curve(time, predicted_forces, name, colour, width=0.8))
         error_curves.append(Curve(time, errors, name, colour, width=0.6))
     error_panel = Panel(

@@ -73,7 +73,7 @@ class Bodies:
         q = 0.5 * (path[1:] + path[:-1])
         zeros = np.zeros_like(q)
         model = self.model
-        parameters = np.asarray(self.parameters)
+        parameters = self.parameters
         if not self.coupled:
             gravity = in_numpy(
                 model, model.forces, q, zeros, zeros, shared=(parameters,)

@@ -59,8 +59,8 @@ def check_motion(
 
 def check_joints(plan: ExcitationPlan) -> Remark:
     """Return whether the joints keep their limits."""
-    derivatives = 4 if np.isfinite(np.asarray(plan.limits.jerk)).any() else 3
-    excess = np.asarray(plan.use)[:derivatives].max() - 1.0
+    derivatives = 4 if np.isfinite(plan.limits.jerk).any() else 3
+    excess = plan.use[:derivatives].max() - 1.0
     quantities = "positions, speeds, accelerations"
     if excess > MAX_ROUNDING:
         text = f"{quantities}: limits are exceeded by {100 * excess:.2g} %"

@@ -67,7 +67,7 @@ def _of_earlier_fit(base: BaseParameters, report: str) -> Nominal:
     is_undetermined = ~np.isfinite(np.diag(covariance))
     covariance[is_undetermined | is_undetermined[:, None]] = 0.0
     names = tuple(base.names[k] for k in np.flatnonzero(is_undetermined))
-    return Nominal(np.asarray(fit.parameters), covariance, names)
+    return Nominal(fit.parameters, covariance, names)
 
 
 def require_weight(setup: Setup, nominal: Nominal | None) -> None:
@@ -142,8 +142,8 @@ def gravity_fault(robot: Robot, limits: ForceLimits) -> str:
 def random_poses(robot: Robot) -> np.ndarray:
     """Return random poses within the joints' range, the first of them near zero."""
     limits = complete_limits(robot)
-    low = np.asarray(limits.position_min)
-    high = np.asarray(limits.position_max)
+    low = limits.position_min
+    high = limits.position_max
     poses = np.random.default_rng(0).uniform(low, high, (RANDOM_POSES, robot.joints))
     poses[0] = np.clip(0.0, low, high)
     return reachable(robot, poses)

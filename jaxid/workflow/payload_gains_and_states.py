@@ -302,7 +302,7 @@ def corrected_gains(columns: Columns, drives: DriveGains) -> dict[str, list[floa
     key = "force_gains" if columns.torque_constants is None else "torque_constants"
     present_values = getattr(columns, key)
     factors = np.array(1.0 if present_values is None else present_values)
-    return {key: (factors * np.asarray(drives.gains)).tolist()}
+    return {key: (factors * drives.gains).tolist()}
 
 
 def identify_states_from_logs(

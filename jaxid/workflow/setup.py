@@ -278,7 +278,7 @@ class Setup(eqx.Module):
         for _ in range(MAX_LOAD_FRICTION_FITS):
             # The columns of the bodies come first, whatever follows.
             size = self.robot.bodies * len(INERTIAL_NAMES)
-            body_parameters = np.asarray(fit.standard_parameters)[:size]
+            body_parameters = fit.standard_parameters[:size]
             bodies = body_parameters.reshape(self.robot.bodies, -1)
             load_friction = LoadFriction(bodies=bodies, transition=transition)
             base = base_parameters(Model(self.robot, (*terms, load_friction)))
@@ -290,7 +290,7 @@ class Setup(eqx.Module):
             fit = dataclasses.replace(fit, notes=every_note)
 
             earlier_coefficients = coefficients
-            coefficients = np.asarray(fit.standard_parameters)[-joints:]
+            coefficients = fit.standard_parameters[-joints:]
             change = np.abs(coefficients - earlier_coefficients).max()
             if change < LOAD_FRICTION_TOLERANCE * np.abs(coefficients).max():
                 return fit

@@ -84,8 +84,8 @@ class BodyBounds(eqx.Module):
         Args:
             robot: Robot whose bodies are bounded.
         """
-        lengths = np.linalg.norm(np.asarray(robot.offset), axis=1)
-        tip_length = float(np.linalg.norm(np.asarray(robot.tip_offset)))
+        lengths = np.linalg.norm(robot.offset, axis=1)
+        tip_length = float(np.linalg.norm(robot.tip_offset))
         chains = [lengths[list(chain)].sum() for chain in robot.ancestors]
         chains[robot.tip_body] += tip_length
         # A robot whose joints all lie in one point gets bounds of one metre.

@@ -147,7 +147,7 @@ class PhysicallyConsistent(AbstractEstimator):
         estimator = dataclasses.replace(self, pull=pull)
         data, program, optimum = estimator._optimise(rows.factors, weights, base)
         p = feasible_set.standard_parameters(data, optimum.y)
-        parameters = np.asarray(base.from_standard(p))
+        parameters = base.from_standard(p)
         bodies = p[np.array(feasible_set.bodies)]
         # Bodies with principal axes have seven parameters, no products of inertia.
         bodies = np.pad(bodies, ((0, 0), (0, 10 - bodies.shape[1])))

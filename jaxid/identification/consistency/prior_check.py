@@ -87,5 +87,5 @@ def _unseen_squares(
         for k, pull in enumerate(pulls):
             p = rows.base.from_standard(solve(training_factors, pull))
             residual_squares = test_factors.residual_squares(np.asarray(p))
-            squares[k] += np.asarray(weights) ** 2 @ residual_squares
+            squares[k] += weights**2 @ residual_squares
     return squares

@@ -39,6 +39,6 @@ def scaled_rows(base: BaseParameters, R: Values, z: Values, rows: Values) -> Sca
     # Base parameters as combinations of the standard ones.
     combination = np.zeros((base.size, base.model.size))
     combination[range(base.size), base.indices] = 1.0
-    combination[:, list(base.dependent)] = np.asarray(base.kappa)
+    combination[:, list(base.dependent)] = base.kappa
     A = (R @ combination) / noise
     return ScaledRows(A, z / noise, 0.5 * xp.asarray(rows, float))

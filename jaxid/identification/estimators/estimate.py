@@ -63,7 +63,7 @@ def joint_rows(weights: Joints) -> Influence:
             chunk.columns,
             residuals.T,
             chunk.mask.T,
-            np.asarray(weights),
+            weights,
             strict=True,
         )
         for columns, theta, residual, mask, weight in joints:

@@ -187,7 +187,7 @@ class CrossValidated(AbstractSolution):
 
     def choose(self, blocks, weights):
         """Test every candidate on every block; reject a single block."""
-        squared_weights = np.asarray(weights) ** 2
+        squared_weights = weights**2
         count = len(blocks.parts)
         errors = np.empty((len(self.candidates), count))
         for k, (other_blocks, part) in enumerate(cross_validation_folds(blocks, count)):

@@ -169,7 +169,7 @@ class SpeedTrials:
         trial_columns = model.size + np.arange(np.prod(shape)).reshape(shape)
         trial_columns = trial_columns[:, is_base]
         # No other parameter depends on the trials: their rows of kappa are zero.
-        kappa = np.asarray(base.kappa)
+        kappa = base.kappa
         trial_kappa = np.zeros((trial_columns.size, kappa.shape[1]))
         extended_base = dataclasses.replace(
             base,

@@ -158,12 +158,12 @@ def _held_friction(problem: RegressionProblem, estimate: Estimate) -> HeldFricti
     rows = 0
     for chunk, motion in zip(spread_rows(problem), motions, strict=True):
         rows += int(chunk.mask.sum())
-        slowness = np.exp(-((np.asarray(motion.qd) / slow_speeds) ** 2))
+        slowness = np.exp(-((motion.qd / slow_speeds) ** 2))
         directions = np.sign(motion.qdd)
         directions[:, list(robot.virtual)] = 0.0
         residuals = chunk.residuals(estimate.parameters)
         channels = estimate.influence(chunk, residuals)
-        weights = np.where(chunk.mask, np.asarray(estimate.weights), 0.0)
+        weights = np.where(chunk.mask, estimate.weights, 0.0)
         for joint, channel in enumerate(channels):
             acting = acting_friction(legs, motion, slowness * directions, joint)
             columns = weights[:, joint, None] * acting

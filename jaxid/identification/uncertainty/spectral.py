@@ -92,7 +92,7 @@ def _widen_by_jackknife(errors: Uncertainty, estimate: Estimate) -> Uncertainty:
     has_deviation = np.isfinite(deviations) & (deviations > 0)
     is_exceeded = errors.jackknife**2 > max_ratios * deviations**2
     deviations = np.where(has_deviation & is_exceeded, errors.jackknife, deviations)
-    covariance = rescale_covariance(np.asarray(errors.covariance), deviations)
+    covariance = rescale_covariance(errors.covariance, deviations)
     return dataclasses.replace(errors, covariance=covariance)
 
 
