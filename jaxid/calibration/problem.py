@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float, Vector
+from jaxid.arrays import Float, Texts, Vector
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import RigidBodies
 from jaxid.program.sample_methods import in_numpy
@@ -61,7 +61,7 @@ class CalibrationProblem:
     """
 
     robot: Robot
-    sessions: tuple[str, ...]
+    sessions: Texts
     frame_keys: tuple[FrameKey, ...]
     starts: Frame
     freedoms: np.ndarray

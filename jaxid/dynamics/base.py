@@ -18,6 +18,7 @@ from jaxid.arrays import (
     Joints,
     ManyJoints,
     Numbers,
+    Texts,
     as_array,
 )
 from jaxid.errors import InputError
@@ -79,7 +80,7 @@ class BaseParameters(Summarised, Hashable):
     kappa: Float[AnyArray, "base dependent"]
     smallest_independent: float
     largest_dependent: float
-    notes: tuple[str, ...] = eqx.field(static=True)
+    notes: Texts = eqx.field(static=True)
 
     @property
     def size(self) -> int:
@@ -87,19 +88,19 @@ class BaseParameters(Summarised, Hashable):
         return len(self.indices)
 
     @property
-    def names(self) -> tuple[str, ...]:
+    def names(self) -> Texts:
         """Names of the standard parameters that lead the base parameters."""
         names = self.model.parameter_names
         return tuple(names[k] for k in self.indices)
 
     @property
-    def units(self) -> tuple[str, ...]:
+    def units(self) -> Texts:
         """Units of the base parameters."""
         units = self.model.parameter_units
         return tuple(units[k] for k in self.indices)
 
     @property
-    def kinds(self) -> tuple[str, ...]:
+    def kinds(self) -> Texts:
         """Terms of the leading parameters in words, like `viscous friction`."""
         kinds = []
         for term in self.model.terms:
@@ -108,7 +109,7 @@ class BaseParameters(Summarised, Hashable):
         return tuple(kinds[k] for k in self.indices)
 
     @functools.cached_property
-    def expressions(self) -> tuple[str, ...]:
+    def expressions(self) -> Texts:
         """Base parameters as readable combinations, `mx2 + 0.05*m3 - mz4` (Eq. 24)."""
         names = self.model.parameter_names
         expressions = []

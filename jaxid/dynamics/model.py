@@ -17,6 +17,7 @@ from jaxid.arrays import (
     JointMatrix,
     Joints,
     ManyJoints,
+    Texts,
     as_array,
     namespace,
 )
@@ -95,12 +96,12 @@ class Model(Hashable):
         return tuple(p for term in self.terms for p in term.parameters(self.robot))
 
     @property
-    def parameter_names(self) -> tuple[str, ...]:
+    def parameter_names(self) -> Texts:
         """Names of the standard parameters, in the order of the columns."""
         return tuple(name for name, _ in self.parameters)
 
     @property
-    def parameter_units(self) -> tuple[str, ...]:
+    def parameter_units(self) -> Texts:
         """Units of the standard parameters."""
         return tuple(unit for _, unit in self.parameters)
 

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Bodies, Float, JointMatrix, Joints
+from jaxid.arrays import AnyArray, Array, Bodies, Float, Indices, JointMatrix, Joints
 from jaxid.robot.inertia import inertia_tensor
 from jaxid.robot.joint_coordinates import (
     all_accelerations,
@@ -129,7 +129,7 @@ def _relative_placements(robot: Robot, q: Joints):
     return rotation @ motion + translation
 
 
-def _zeros_at(joints: tuple[int, ...], robot: Robot, dtype: Any):
+def _zeros_at(joints: Indices, robot: Robot, dtype: Any):
     """Return zero for some joints and one for all others."""
     factors = np.ones(robot.bodies)
     factors[list(joints)] = 0.0

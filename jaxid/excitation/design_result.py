@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, double_precision
+from jaxid.arrays import AnyArray, Float, Texts, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.result_table import (
     MISSING,
@@ -131,7 +131,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         return not self.diagnosis
 
     @property
-    def diagnosis(self) -> tuple[str, ...]:
+    def diagnosis(self) -> Texts:
         """Sentences about the limits that are not kept; empty if all are."""
         return tuple(str(f) for f in self.findings if f.value > 0)
 
@@ -178,7 +178,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         return driven_robot(self.base.model.robot)
 
     @property
-    def undetermined(self) -> tuple[str, ...]:
+    def undetermined(self) -> Texts:
         """Names of base parameters that this motion cannot determine.
 
         Their deviations make forces that are more than ten times the noise (RMS), a

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Texts
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm, LoadFriction, StribeckFriction, Tanh
@@ -143,7 +144,7 @@ class ModelSearch:
             if isinstance(setup.filter, ZeroPhaseButterworth):
                 table["kind"] = "butterworth"
             self.text = changed_text(self.text, {"filter": table})
-        self._changes: tuple[str, ...] = ()
+        self._changes: Texts = ()
         logs = self._observe(setup)
         max_speeds = [np.abs(log.motion.qd).max(axis=0) for log in logs]
         driven = list(setup.robot.driven)

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Joints, Matrix, Vector, relative_norm
+from jaxid.arrays import AnyArray, Float, Joints, Matrix, Texts, Vector, relative_norm
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.friction_state import with_memory
@@ -72,7 +72,7 @@ class Trial(NamedTuple):
             squared force.
     """
 
-    changes: tuple[str, ...]
+    changes: Texts
     size: int
     squares: Vector
 
@@ -190,7 +190,7 @@ class UnseenParts(NamedTuple):
     priors: Float[AnyArray, "parts columns"]
     ridges: Vector
 
-    def trial(self, changes: tuple[str, ...], columns: Sequence[int]) -> Trial:
+    def trial(self, changes: Texts, columns: Sequence[int]) -> Trial:
         """Return the errors of the model with some of the columns."""
         total = self.training.sum(axis=0)
         entries = [*columns, -1]

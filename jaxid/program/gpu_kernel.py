@@ -15,7 +15,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Array, Float
+from jaxid.arrays import Array, Float, Indices
 
 from .jax_transformation_rules import divisible
 from .program import Program, Shape
@@ -249,7 +249,7 @@ def _alike(x: Array, shape: Shape) -> jax.ShapeDtypeStruct:
     return jax.eval_shape(lambda x: jnp.broadcast_to(x[0, 0], shape), x)
 
 
-def _positions_by_use(program: Program, nodes: Sequence[int]) -> tuple[int, ...]:
+def _positions_by_use(program: Program, nodes: Sequence[int]) -> Indices:
     """Return positions of these nodes and of what they need, inputs where first read.
 
     If all inputs were loaded at the start, a thread's registers would not hold them.

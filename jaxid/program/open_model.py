@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, is_traced
+from jaxid.arrays import AnyArray, Array, Indices, is_traced
 
 
 class OpenModel(eqx.Module):
@@ -14,7 +14,7 @@ class OpenModel(eqx.Module):
     model: eqx.Module  # model; in the place of these numbers it has any others
     method: str = eqx.field(static=True)  # name of the method
     # leaves of the model that have such numbers, and their positions in each
-    places: tuple[tuple[int, tuple[int, ...]], ...] = eqx.field(static=True)
+    places: tuple[tuple[int, Indices], ...] = eqx.field(static=True)
 
     def call(self, numbers: AnyArray, *arguments: AnyArray) -> Array:
         """Call the method of the model with these numbers."""

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import jax
 import numpy as np
 
+from jaxid.arrays import Indices, Texts
 from jaxid.errors import InputError
 
 from .scalar import Graph, Operand, Operation, Scalar, live_scalars
@@ -32,7 +33,7 @@ class Node(NamedTuple):
     operands: tuple[Reference, ...]
 
     @property
-    def uses(self) -> tuple[int, ...]:
+    def uses(self) -> Indices:
         """Positions of the nodes that are operands."""
         if self.operation is Operation.INPUT:
             return ()
@@ -82,7 +83,7 @@ class Program:
     output_shapes: Shapes
     structure: Any = field(repr=False)  # tree structure of the function's result
     # for each node the `jax.named_scope` of the function in which it was made
-    labels: tuple[str, ...] = field(default=(), repr=False)
+    labels: Texts = field(default=(), repr=False)
     # the same program as loops over its equal parts (`Loops`), or None
     loops: Any = field(default=None, repr=False)
 
@@ -105,7 +106,7 @@ class Program:
         )
 
     @functools.cached_property
-    def uses(self) -> tuple[int, ...]:
+    def uses(self) -> Indices:
         """Number of nodes and outputs that read each node."""
         counts = Counter(x for x in self.outputs if isinstance(x, int))
         for node in self.nodes:
@@ -113,7 +114,7 @@ class Program:
         return tuple(counts[k] for k in range(len(self.nodes)))
 
     @functools.cached_property
-    def distinct(self) -> tuple[tuple[int, ...], np.ndarray]:
+    def distinct(self) -> tuple[Indices, np.ndarray]:
         """Nodes of the packed result, and for each entry its number, or -1."""
         nodes = dict.fromkeys(x for x in self.outputs if isinstance(x, int))
         numbers = {node: number for number, node in enumerate(nodes)}

@@ -16,7 +16,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.custom_batching import custom_vmap
 
-from jaxid.arrays import Array, Float
+from jaxid.arrays import Array, Float, Indices
 
 from .gpu_kernel import in_kernel, suits_kernel
 from .jax_transformation_rules import TRUE, differing_alike, with_derivatives_of
@@ -259,7 +259,7 @@ def _one_after_the_other(run: Callable, inputs: list[tuple[Array, bool]]):
 
 
 def row_products(
-    program: Program, groups: tuple[tuple[int, ...], ...], *arrays: Array
+    program: Program, groups: tuple[Indices, ...], *arrays: Array
 ) -> list[Array]:
     """Return sums over samples of products of results, which are not stored.
 

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray
+from jaxid.arrays import AnyArray, Indices
 
 # The palette of Okabe and Ito, which colour-blind readers can tell apart. Orange and
 # sky are darker than theirs, so that lines have a contrast of 3 to 1 on white.
@@ -108,7 +108,7 @@ class Scene:
     time: np.ndarray  # (samples,): their instants [s]
     points: np.ndarray  # (samples, points, 3): all bodies' origins, and the tip [m]
     # body from whose origin the line to each point leads; -1 for the ground
-    links: tuple[int, ...]
+    links: Indices
     frames: np.ndarray  # samples at which the page shows the robot
     # (samples, joints): values of the joints, as colours; None for none
     values: np.ndarray | None = None

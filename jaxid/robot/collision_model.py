@@ -9,7 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array, Float, Hashable, Joints, double_precision
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    Float,
+    Hashable,
+    Indices,
+    Joints,
+    Texts,
+    double_precision,
+)
 from jaxid.errors import InputError
 
 from .forward_kinematics import placements
@@ -54,9 +63,9 @@ class CollisionModel(Hashable):
     capsules: tuple[Capsule, ...]
     obstacles: tuple[HalfSpace | Box, ...]
     pairs: tuple[tuple[int, int], ...] = eqx.field(static=True)
-    groups: tuple[tuple[int, ...], ...] = eqx.field(static=True)
+    groups: tuple[Indices, ...] = eqx.field(static=True)
     room: tuple[float, ...] = eqx.field(static=True)
-    notes: tuple[str, ...] = eqx.field(static=True)
+    notes: Texts = eqx.field(static=True)
 
     def __init__(
         self,
@@ -95,7 +104,7 @@ class CollisionModel(Hashable):
         return [shape.name for shape in (*self.capsules, *self.obstacles)]
 
     @property
-    def pair_names(self) -> tuple[str, ...]:
+    def pair_names(self) -> Texts:
         """Names of each clearance's two shapes; of the first ones if they are more."""
         shape_names = self._names
         body_names: dict[int | str, str] = {}

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import Numbers
+from jaxid.arrays import Numbers, Texts
 from jaxid.errors import InputError
 
 from .collision_model import CollisionModel
@@ -31,12 +31,12 @@ def from_dh(
     convention: str,
     name: str = "robot",
     revolute: tuple[bool, ...] | None = None,
-    joint_names: tuple[str, ...] | None = None,
+    joint_names: Texts | None = None,
     base_rotation: Numbers | None = None,
     base_position: Numbers = (0.0, 0.0, 0.0),
     tip_rotation: Numbers | None = None,
     tip_offset: Numbers = (0.0, 0.0, 0.0),
-    notes: tuple[str, ...] = (),
+    notes: Texts = (),
     **fields: Any,
 ) -> Robot:
     r"""Build a serial robot from a row (alpha, a, d, theta) for each joint.

@@ -15,6 +15,7 @@ from jaxid.arrays import (
     Joints,
     ManyJoints,
     Numbers,
+    Texts,
     given,
     namespace,
 )
@@ -69,7 +70,7 @@ class Limits(eqx.Module):
     acceleration: Joints = eqx.field(converter=given, default=None)
     jerk: Joints = eqx.field(converter=given, default=None)
     force: Joints = eqx.field(converter=given, default=None)
-    assumed: tuple[str, ...] = eqx.field(static=True, default=())
+    assumed: Texts = eqx.field(static=True, default=())
 
     def __post_init__(self, joints: int | None):
         # All but the ends of the ranges are sizes, which must be positive.

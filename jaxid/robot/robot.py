@@ -15,6 +15,7 @@ from jaxid.arrays import (
     ManyJoints,
     Matrix3,
     Numbers,
+    Texts,
     Vector3,
     as_finite_array,
     given,
@@ -50,8 +51,7 @@ class Robot(Summarised, Hashable):
     its parent at `offset` with the attitude `rotation`; a revolute joint turns it about
     `axis`, a prismatic joint moves it along `axis`. Geometry may consist of NumPy
     arrays (constants of compiled code), which are checked, or of JAX arrays (inputs:
-    batches of geometries, derivatives with respect to lengths), which are taken as they
-    are.
+    batches of geometries, derivatives by lengths), which are taken as they are.
 
     Args:
         name: Name of the robot.
@@ -93,8 +93,8 @@ class Robot(Summarised, Hashable):
 
     name: str = eqx.field(static=True)
     _: dataclasses.KW_ONLY
-    joint_names: tuple[str, ...] = eqx.field(static=True, converter=given, default=None)
-    parent: tuple[int, ...] = eqx.field(static=True, converter=given, default=None)
+    joint_names: Texts = eqx.field(static=True, converter=given, default=None)
+    parent: Indices = eqx.field(static=True, converter=given, default=None)
     followers: Followers = ()
     loops: tuple[Loop, ...] = ()
     loop_rows: Indices = eqx.field(static=True, default=())
@@ -117,8 +117,8 @@ class Robot(Summarised, Hashable):
     source_tip: str | None = eqx.field(static=True, default=None)
     source_base: str | None = eqx.field(static=True, default=None)
     source_arguments: tuple[tuple[str, str], ...] = eqx.field(static=True, default=())
-    notes: tuple[str, ...] = eqx.field(static=True, default=())
-    virtual: tuple[int, ...] = eqx.field(static=True, default=())
+    notes: Texts = eqx.field(static=True, default=())
+    virtual: Indices = eqx.field(static=True, default=())
     floating: bool = eqx.field(static=True, default=False)
     imu: Imu = eqx.field(static=True, default=Imu())
     contacts: tuple[Contact, ...] = eqx.field(static=True, default=())
@@ -242,17 +242,17 @@ class Robot(Summarised, Hashable):
         return len(self.revolute) + len(self.followers)
 
     @property
-    def driven(self) -> tuple[int, ...]:
+    def driven(self) -> Indices:
         """Indices of the joints that are not virtual."""
         return tuple(i for i in range(self.joints) if i not in self.virtual)
 
     @property
-    def rigid(self) -> tuple[int, ...]:
+    def rigid(self) -> Indices:
         """Indices of the virtual joints without velocity and acceleration."""
         return self.virtual[GROUP:] if self.floating else self.virtual
 
     @property
-    def sensor_bodies(self) -> tuple[int, ...]:
+    def sensor_bodies(self) -> Indices:
         """Indices of the bodies behind force sensors."""
         return self.rigid[GROUP - 1 :: GROUP]
 
@@ -262,12 +262,12 @@ class Robot(Summarised, Hashable):
         return self.virtual[:1] == (0,) and not self.floating
 
     @property
-    def solid_bodies(self) -> tuple[int, ...]:
+    def solid_bodies(self) -> Indices:
         """Indices of the bodies that have a mass."""
         return solid_bodies(self)
 
     @property
-    def numbers(self) -> tuple[int, ...]:
+    def numbers(self) -> Indices:
         """For each body the number in names of parameters."""
         return numbers_of_bodies(self.bodies, self.virtual)
 
@@ -277,7 +277,7 @@ class Robot(Summarised, Hashable):
         return (*self.revolute, *(f.revolute for f in self.followers))
 
     @property
-    def body_names(self) -> tuple[str, ...]:
+    def body_names(self) -> Texts:
         """Names of the joints that move the bodies, or of these bodies."""
         names = [*self.joint_names, *(f.name for f in self.followers)]
         for last in self.virtual[GROUP - 1 :: GROUP]:
@@ -285,14 +285,14 @@ class Robot(Summarised, Hashable):
         return tuple(names)
 
     @property
-    def order(self) -> tuple[int, ...]:
+    def order(self) -> Indices:
         """Bodies in an order in which each comes after the one that carries it."""
         return order_from_ground(self.parent, len(self.followers))
 
     @property
-    def ancestors(self) -> tuple[tuple[int, ...], ...]:
+    def ancestors(self) -> tuple[Indices, ...]:
         """For every body those from the ground to itself, whose joints move it."""
-        chains: list[tuple[int, ...]] = [()] * self.bodies
+        chains: list[Indices] = [()] * self.bodies
         for body in self.order:
             parent = self.parent[body]
             parent_chain = chains[parent] if parent >= 0 else ()

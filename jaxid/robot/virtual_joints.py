@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import Matrix3, Vector3
+from jaxid.arrays import Indices, Matrix3, Vector3
 from jaxid.errors import InputError
 
 from .limits_and_drives import of_joints
@@ -24,12 +24,12 @@ FORCE_NAMES = ("fx", "fy", "fz", "mx", "my", "mz")
 """Endings of the names of a group's joints: forces along, moments about the axes."""
 
 
-def frames_between(virtual: tuple[int, ...]) -> set[int]:
+def frames_between(virtual: Indices) -> set[int]:
     """Return the indices of the bodies between two virtual joints of a group."""
     return {*virtual} - {*virtual[GROUP - 1 :: GROUP]}
 
 
-def solid_bodies(robot: Any) -> tuple[int, ...]:
+def solid_bodies(robot: Any) -> Indices:
     """Return the indices of the bodies that have a mass.
 
     A base on a sensor does not move: its gravity is a part of the sensor's bias.
@@ -40,7 +40,7 @@ def solid_bodies(robot: Any) -> tuple[int, ...]:
     return tuple(i for i in range(robot.bodies) if i not in massless)
 
 
-def numbers_of_bodies(bodies: int, virtual: tuple[int, ...]) -> tuple[int, ...]:
+def numbers_of_bodies(bodies: int, virtual: Indices) -> Indices:
     """Return for each body the number in names of parameters.
 
     Driven joints and their bodies have the numbers 1, 2, …; a base before them has the

@@ -5,6 +5,8 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
+from jaxid.arrays import Indices, Texts
+
 from .joint_fits import JointFit
 from .motion import FreeParameters, JointParameters
 from .servo import INDEX, LOWER, START, UPPER
@@ -41,7 +43,7 @@ IMITATING_EFFECTS = ("f", "ki", "um")
 SATURATION_SHARES = (0.2, 0.5, 1.0)
 """Starts of the largest torque, over the usual start."""
 
-Groups = tuple[tuple[int, ...], ...]
+Groups = tuple[Indices, ...]
 """Indices of the joints of each kind, which are equal as far as the logs tell."""
 
 
@@ -141,7 +143,7 @@ class EffectChoice:
         self.choose(("mu",), ("Fs", "vs"), ("mu", "Fs", "vs"))
         self.choose(("um",))
 
-    def choose(self, *candidates: tuple[str, ...]) -> None:
+    def choose(self, *candidates: Texts) -> None:
         """Add effects that lower held-out errors, each to the best of those before.
 
         Args:
@@ -190,7 +192,7 @@ class EffectChoice:
         )
         self.fit = fit.mixed_with(trial, choice).weighed_by_errors()
 
-    def with_effects(self, effects: tuple[str, ...]) -> JointFit:
+    def with_effects(self, effects: Texts) -> JointFit:
         """Return the fit with further effects."""
         parameters = self.fit.parameters.copy()
         free_mask = self.fit.free.copy()

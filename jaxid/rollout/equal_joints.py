@@ -8,6 +8,7 @@ import dataclasses
 import re
 from collections.abc import Sequence
 
+from jaxid.arrays import Indices
 from jaxid.errors import InputError
 
 from .joint_fits import JointFit, Pull
@@ -26,7 +27,7 @@ PULL_STEPS = 5
 
 def joint_groups(
     names: Sequence[str], alike: Sequence[Sequence[str]] | None
-) -> tuple[tuple[int, ...], ...]:
+) -> tuple[Indices, ...]:
     """Return the joints of each kind; a joint of no kind is alone.
 
     Args:

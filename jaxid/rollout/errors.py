@@ -6,7 +6,7 @@ from itertools import cycle
 
 import numpy as np
 
-from jaxid.arrays import Matrix, Vector
+from jaxid.arrays import Matrix, Texts, Vector
 from jaxid.result_table import Column, Summarised, Table
 
 Paths = tuple[np.ndarray, ...]
@@ -29,8 +29,8 @@ class RolloutErrors(Summarised):
         manner: How the robot is simulated, like `free-running`.
     """
 
-    joint_names: tuple[str, ...]
-    motions: tuple[str, ...]
+    joint_names: Texts
+    motions: Texts
     time: tuple[np.ndarray, ...]
     measured: Paths
     simulated: Paths

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxid.arrays import Numbers, Vector
+from jaxid.arrays import Numbers, Texts, Vector
 from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
@@ -302,7 +302,7 @@ def _require_motion(motion: ServoMotion) -> None:
 
 def _joint_names(
     motion: ServoMotion, bodies: Bodies | None, names: Sequence[str] | None
-) -> tuple[str, ...]:
+) -> Texts:
     """Return the names of the joints: those given, of the bodies, or numbers."""
     count = motion.positions.shape[1]
     if bodies is not None:

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Bool, Float, Matrix, Vector
+from jaxid.arrays import Bool, Float, Matrix, Texts, Vector
 from jaxid.errors import InputError
 from jaxid.measurement.recording import Recording
 
@@ -68,7 +68,7 @@ class ServoMotion:
     sample_time: Vector
     begin: Vector
     lengths: tuple[int, ...]
-    names: tuple[str, ...]
+    names: Texts
 
     @classmethod
     def of(cls, logs: Sequence[Recording], contacts: Contacts = ()) -> "ServoMotion":

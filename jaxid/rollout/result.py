@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import Vector
+from jaxid.arrays import Texts, Vector
 from jaxid.identification.run_to_run import Run
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.measurement.recording import Recording
@@ -59,7 +59,7 @@ class ServoFit(Summarised):
         left_out: Number of samples within them, which the fit left out.
     """
 
-    joint_names: tuple[str, ...]
+    joint_names: Texts
     parameters: JointParameters
     free: FreeParameters
     uncertainty: Uncertainty
@@ -68,10 +68,10 @@ class ServoFit(Summarised):
     hold: bool
     time_step: float
     rms: Vector
-    motions: tuple[str, ...]
+    motions: Texts
     bodies: Bodies | None
     load: Vector
-    notes: tuple[str, ...] = ()
+    notes: Texts = ()
     hold_is_told: bool = True
     gains: Mapping[str, Vector] = dataclasses.field(default_factory=dict)
     compliances: tuple[Combination, ...] = ()
@@ -82,7 +82,7 @@ class ServoFit(Summarised):
     def of(
         cls,
         fit: JointFit,
-        joint_names: tuple[str, ...],
+        joint_names: Texts,
         groups: Sequence[Sequence[int]],
         undetermined: FreeParameters,
         **fields: Any,
@@ -320,9 +320,7 @@ def _status(combination: Combination) -> Status:
     return Status.NEUTRAL if depends_on_masses else Status.GOOD
 
 
-def _notes_on_effects(
-    undetermined: FreeParameters, joint_names: tuple[str, ...]
-) -> list[str]:
+def _notes_on_effects(undetermined: FreeParameters, joint_names: Texts) -> list[str]:
     """Return a note for each effect that lowers errors and is not determined."""
     notes = []
     for k, parameter in enumerate(PARAMETERS):
@@ -337,7 +335,7 @@ def _notes_on_effects(
     return notes
 
 
-def _notes_on_limits(fit: JointFit, joint_names: tuple[str, ...]) -> list[str]:
+def _notes_on_limits(fit: JointFit, joint_names: Texts) -> list[str]:
     """Return a note for each parameter that stands at a limit of the search."""
     notes = []
     for j, k in np.argwhere(fit.free):

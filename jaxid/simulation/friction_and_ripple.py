@@ -14,7 +14,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Hashable, Joints
+from jaxid.arrays import Hashable, Joints, Texts
 from jaxid.dynamics.terms import AbstractTerm, CoulombFriction, Tanh, ViscousFriction
 from jaxid.robot.robot import Robot
 
@@ -46,7 +46,7 @@ class AbstractGearFriction(Hashable):
 
     viscous: eqx.AbstractVar[Joints]
     coulomb: eqx.AbstractVar[Joints]
-    dry: ClassVar[tuple[str, ...]] = ("coulomb",)
+    dry: ClassVar[Texts] = ("coulomb",)
 
     @abstractmethod
     def steady(self, qd: Joints) -> Joints:
@@ -98,7 +98,7 @@ class SmoothFriction(AbstractGearFriction):
         stribeck_speed: $v_s$ [rad/s or m/s].
     """
 
-    dry: ClassVar[tuple[str, ...]] = ("coulomb", "stribeck")
+    dry: ClassVar[Texts] = ("coulomb", "stribeck")
     viscous: Joints
     coulomb: Joints
     stribeck: Joints | float = 0.0
@@ -147,7 +147,7 @@ class LuGreFriction(AbstractGearFriction):
         damping_time: $\sigma_1 / \sigma_0$ at rest [s].
     """
 
-    dry: ClassVar[tuple[str, ...]] = ("coulomb", "breakaway")
+    dry: ClassVar[Texts] = ("coulomb", "breakaway")
     viscous: Joints
     coulomb: Joints
     breakaway: Joints

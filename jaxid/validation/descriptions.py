@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 import scipy
 
-from jaxid.arrays import Matrix3
+from jaxid.arrays import Indices, Matrix3
 from jaxid.dynamics import projection_equation
 from jaxid.dynamics.model import Model
 from jaxid.program.sample_methods import in_numpy
@@ -218,7 +218,7 @@ class DescribedLog:
         friction = np.sum(samples[:, :, body_count:] * friction_parameters, axis=2)
         return samples[:, :, :body_count] @ parameters[:body_count] + friction
 
-    def with_low_pass(self, joints: tuple[int, ...], cutoff: float) -> Rows:
+    def with_low_pass(self, joints: Indices, cutoff: float) -> Rows:
         """Return the rows if a filter made the forces of some joints late."""
         order = 2 if len(joints) == 1 else 1
         sections = scipy.signal.butter(order, cutoff, fs=GRID_RATE, output="sos")
@@ -237,7 +237,7 @@ class DescribedLog:
             columns[:, joint, start : start + shapes] = late_rows[:, body_count:]
         return self.rows._replace(columns=columns)
 
-    def with_earlier_forces(self, joints: tuple[int, ...], delay: float) -> Rows:
+    def with_earlier_forces(self, joints: Indices, delay: float) -> Rows:
         """Return the rows with forces of some joints that stand later in the log."""
 
         def earlier(x: np.ndarray) -> np.ndarray:

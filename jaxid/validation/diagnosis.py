@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Indices, Numbers
+from jaxid.arrays import AnyArray, Indices, Numbers, Texts
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
@@ -61,14 +61,14 @@ class Diagnosis(Summarised):
     log: Recording | Observations
     robot: Robot
     statistics: LogStatistics
-    findings: tuple[str, ...]
-    faulty: tuple[int, ...]
+    findings: Texts
+    faulty: Indices
     observations: Observations | None
     excerpt: Recording
-    notes: tuple[str, ...] = ()
+    notes: Texts = ()
     commands: Recording | None = None
     is_mistaken: bool = False
-    imu_mistakes: tuple[str, ...] = ()
+    imu_mistakes: Texts = ()
 
     def with_fit(self, fit: Fit, bodies: np.ndarray | None = None) -> "Diagnosis":
         """Return the diagnosis with findings of a fit to this log alone.
@@ -225,7 +225,7 @@ class _ExaminedLog(NamedTuple):
     excerpt: Recording
     all_observations: Observations
     observations: Observations | None
-    notes: tuple[str, ...] = ()
+    notes: Texts = ()
 
 
 def _examined_log(
@@ -294,9 +294,9 @@ class LogMistakes(NamedTuple):
         are_gains: Whether the certain mistakes are gains of forces.
     """
 
-    certain: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
-    remarks: tuple[str, ...] = ()
+    certain: Texts = ()
+    doubts: Texts = ()
+    remarks: Texts = ()
     delay: Delay | None = None
     are_gains: bool = False
 
@@ -315,7 +315,7 @@ def mistakes_in_logs(
     if len(diagnoses) > 1:
         return mistakes
 
-    def named(texts: Iterable[str]) -> tuple[str, ...]:
+    def named(texts: Iterable[str]) -> Texts:
         return tuple(f"{diagnoses[0].log.name}: {text}" for text in texts)
 
     return LogMistakes(

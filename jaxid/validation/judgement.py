@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from scipy import special
 
+from jaxid.arrays import Texts
 from jaxid.dynamics.terms import ConstantOffset
 from jaxid.identification.fit_result import Fit
 from jaxid.result_table import Remark, Status, percent, significant, sort_remarks
@@ -133,7 +134,7 @@ class Report:
         return (*self.identification, *self.verification)
 
     @property
-    def every_note(self) -> tuple[str, ...]:
+    def every_note(self) -> Texts:
         """Notes on the robot, the fit and the logs, each once."""
         fit = self.fit
         return tuple(

@@ -6,6 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Texts
 from jaxid.dynamics.model import Model
 from jaxid.identification.delay import Delay
 from jaxid.measurement.observations import Progress
@@ -132,11 +133,11 @@ class Mistakes(NamedTuple):
         are_gains: Whether gains of forces explain what the model misses.
     """
 
-    explained: tuple[str, ...] = ()
-    unexplained: tuple[str, ...] = ()
-    possible: tuple[str, ...] = ()
-    doubts: tuple[str, ...] = ()
-    rest: tuple[str, ...] = ()
+    explained: Texts = ()
+    unexplained: Texts = ()
+    possible: Texts = ()
+    doubts: Texts = ()
+    rest: Texts = ()
     delay: Delay | None = None
     are_gains: bool = False
 

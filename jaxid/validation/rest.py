@@ -2,6 +2,7 @@
 
 import numpy as np
 
+from jaxid.arrays import Texts
 from jaxid.result_table import significant
 
 from .descriptions import DescribedLog
@@ -17,7 +18,7 @@ MAX_REMAINDER = 0.5
 """Share of that error that remains if rows at rest are left out."""
 
 
-def rest_remarks(described_log: DescribedLog) -> tuple[str, ...]:
+def rest_remarks(described_log: DescribedLog) -> Texts:
     """Return a sentence if the rows at rest are most of what a model misses."""
     moving_judge = described_log.judge
     judge = Judge(np.ones_like(moving_judge.mask), moving_judge.folds)

@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Indices
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import significant
 from jaxid.robot.rotations import axis_rotation
@@ -378,7 +379,7 @@ class SuspectedMistakes:
         for j, cutoff in itertools.product(self._joints, LOW_PASSES):
             yield self._low_pass((j,), cutoff, f"the force of joint {self._names[j]}")
 
-    def _low_pass(self, joints: tuple[int, ...], cutoff: float, forces: str) -> Suspect:
+    def _low_pass(self, joints: Indices, cutoff: float, forces: str) -> Suspect:
         sentence = f"a low-pass of about {cutoff:g} Hz seems to delay {forces}"
         return Suspect(sentence, lambda: self._log.with_low_pass(joints, cutoff))
 
@@ -394,7 +395,7 @@ class SuspectedMistakes:
                 yield self._twist(j, direction)
                 yield self._length(j, direction)
 
-    def _delay(self, joints: tuple[int, ...]) -> Quantity:
+    def _delay(self, joints: Indices) -> Quantity:
         def sentence(seconds: float) -> str:
             if joints == tuple(self._joints):
                 return (

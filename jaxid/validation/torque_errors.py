@@ -230,8 +230,8 @@ class Validation(Summarised, eqx.Module):
 
     errors: tuple[TorqueErrors, ...]
     definiteness: Definiteness
-    joint_names: tuple[str, ...] = eqx.field(static=True)
-    units: tuple[str, ...] = eqx.field(static=True)
+    joint_names: Texts = eqx.field(static=True)
+    units: Texts = eqx.field(static=True)
 
     def summary(self) -> Table:
         """Return a table: RMS errors, a row for each joint, a column for each log."""

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Bodies
+from jaxid.arrays import AnyArray, Bodies, Indices
 from jaxid.dynamics import projection_equation, spatial_dynamics
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS
 from jaxid.robot.robot import Robot
@@ -34,7 +34,7 @@ class RigidBodies(AbstractTerm):
         """Number of inertial parameters of each body: ten, or seven."""
         return PRINCIPAL_PARAMETERS if self.principal_axes else len(INERTIAL_NAMES)
 
-    def bodies(self, robot: Robot) -> tuple[int, ...]:
+    def bodies(self, robot: Robot) -> Indices:
         """Return the indices of the bodies whose parameters are unknown."""
         return robot.solid_bodies
 
