@@ -10,6 +10,7 @@ form compiles soon, is differentiated fast, and takes the geometry as an input.
 
 from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 
@@ -23,6 +24,7 @@ from jaxid.robot.joint_coordinates import (
     on_coordinates,
 )
 from jaxid.robot.robot import Robot
+from jaxid.robot.rotations import rotation_about
 
 Spatial = Float[Array, "bodies 6"]
 
@@ -78,8 +80,9 @@ def all_placements(robot: Robot, q: Joints) -> Array:
     """
     dtype = q.dtype
     # First in the frame of the parent, then in that of a body further above.
+    bottom_rows = np.broadcast_to(np.eye(4)[3:], (robot.bodies, 1, 4))
     placements = jnp.concatenate(
-        [_relative_placements(robot, q), _bottom_rows(robot, dtype)], axis=1
+        [_relative_placements(robot, q), jnp.asarray(bottom_rows, dtype)], axis=1
     )
     ancestors = np.array(robot.parent)
     while (ancestors >= 0).any():
@@ -95,38 +98,22 @@ def all_placements(robot: Robot, q: Joints) -> Array:
     return placements
 
 
-def _bottom_rows(robot: Robot, dtype: Any):
-    """Return the last rows of homogeneous matrices."""
-    return jnp.asarray(np.broadcast_to(np.eye(4)[3:], (robot.bodies, 1, 4)), dtype)
-
-
 def _relative_placements(robot: Robot, q: Joints):
     """Return rotation and position of each body in its parent's frame."""
     dtype = q.dtype
     axis = jnp.asarray(robot.axis, dtype)
-    rotation = jnp.asarray(robot.rotation, dtype)
     offset = jnp.asarray(robot.offset, dtype)
-    is_revolute = np.array(robot.turns)[:, None, None]
-    is_turning = jnp.asarray(is_revolute, dtype)
-    slides = jnp.asarray(~is_revolute, dtype)
-    angle = all_coordinates(robot, q)[:, None, None]
+    rotation = jnp.asarray(robot.rotation, dtype)
+    q = all_coordinates(robot, q)
     if robot.virtual:
-        angle = angle * _zeros_at(robot.virtual, robot, dtype)[:, None, None]
-
-    # Rodrigues: I + sin(q) [axis] + (1 - cos(q)) [axis]^2, if the joint turns.
-    identity = jnp.eye(3, dtype=dtype)[None]
-    axis_column = axis[:, :, None]
-    axial_part = axis_column * axis[:, None, :]
-    normal_part = is_turning * (identity - axial_part)
-    sideways = is_turning * _combine(SKEW, axis)
-    turn = identity + (jnp.cos(angle) - 1) * normal_part
-    turn = turn + jnp.sin(angle) * sideways
-
-    shift = slides * angle * axis_column
-    motion = jnp.concatenate([turn, shift], axis=2)
+        q = q * _zeros_at(robot.virtual, robot, dtype)
+    is_turning = np.array(robot.turns)
+    rest = jnp.zeros_like(q)
+    turns = jax.vmap(rotation_about)(axis, jnp.where(is_turning, q, rest))
+    shifts = axis * jnp.where(is_turning, rest, q)[:, None]
+    motions = jnp.concatenate([turns, shifts[:, :, None]], axis=2)
     last_column = ((0, 0), (0, 0), (3, 0))
-    translation = jnp.pad(offset[:, :, None], last_column)
-    return rotation @ motion + translation
+    return rotation @ motions + jnp.pad(offset[:, :, None], last_column)
 
 
 def _zeros_at(joints: Indices, robot: Robot, dtype: Any):

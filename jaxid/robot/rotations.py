@@ -48,7 +48,7 @@ def rotation_about(axis: Vector3, angle: AnyArray) -> Rotations:
     """
     xp = namespace(axis, angle)
     axial_part = axis[:, None] * axis[None, :]
-    normal_part = np.eye(3) - axial_part
+    normal_part = np.eye(3, dtype=axial_part.dtype) - axial_part
     cosine = xp.cos(angle)[..., None, None]
     sine = xp.sin(angle)[..., None, None]
     return axial_part + cosine * normal_part + sine * skew(axis)
