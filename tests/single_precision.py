@@ -148,6 +148,9 @@ CASES = {
     ),
     "PhysicallyConsistent": lambda: consistent().parameters,
     "identify_batch": batch,
+    "bootstrap": lambda: jid.uncertainty.bootstrap(
+        jid.RegressionProblem(base, [cold]).blocks, np.ones(2), 20, key
+    ),
     "identify_states": lambda: jid.identify_states(runs()).parameters,
     "update": lambda: jid.combine_fits(*runs()).parameters,
     "compare": lambda: jid.compare(plain(), jid.identify(base, warm)).difference,
@@ -168,6 +171,7 @@ CASES = {
 }
 REFUSED = (
     "identify_batch",
+    "bootstrap",
     "design_excitation",
 )
 """Cases that compute in JAX, which must not do so in float32."""

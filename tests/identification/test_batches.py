@@ -9,13 +9,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from virtual import observations, standard_parameters
+from virtual import left_out_in_turn, observations, standard_parameters
 
 import jaxid as jid
 from jaxid.arrays import in_parts
 from jaxid.identification import many_data_sets
 from jaxid.identification.batch_solution import MAX_CONDITION, BatchFit
+from jaxid.identification.factors import Blocks
+from jaxid.identification.identify import fit_problem
 from jaxid.identification.many_data_sets import identify_batch
+from jaxid.identification.uncertainty.blocks import bootstrap
 from jaxid.program import sample_methods
 
 SAMPLES = 150
@@ -361,3 +364,23 @@ def test_refusals(base, arrays, samples, options, message):
         identify_batch(base, arrays[0], arrays[1][:, samples], **options)
     with pytest.raises(ValueError, match="4 rows"):
         identify_batch(base, *jax.tree.map(lambda x: x[:, :2], arrays))
+
+
+def test_bootstrap_agrees_with_the_scatter_of_blocks(base):
+    o = observations(
+        base.model, standard_parameters(base.model), samples=12000, noise=2.0
+    )
+    order = np.random.default_rng(0).permutation(12000)
+    o = o.replace(motion=o.motion[order], forces=o.forces[order])
+    blocks = jid.RegressionProblem(base, [o], divisions=60).blocks
+    with pytest.raises(ValueError, match="at least two blocks"):
+        bootstrap(Blocks(blocks.parts[:1]), WEIGHTS, 50, jax.random.key(0))
+    fit = fit_problem(
+        jid.RegressionProblem(base, blocks=blocks), jid.estimators.LeastSquares()
+    )
+    draws = bootstrap(blocks, fit.weights, 4000, jax.random.key(0))
+    np.testing.assert_allclose(
+        np.mean(draws, axis=0), fit.parameters, atol=0.2 * fit.standard_deviations.max()
+    )
+    jackknife = np.std(left_out_in_turn(blocks, fit.weights), axis=0) * np.sqrt(59)
+    np.testing.assert_allclose(np.std(draws, axis=0), jackknife, rtol=0.1)

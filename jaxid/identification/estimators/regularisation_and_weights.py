@@ -87,7 +87,7 @@ class Decomposition(eqx.Module):
 
 
 def inverse_information(
-    information: Float[Array, "base base"],
+    information: Float[Array, "base base"], ridge: float = RIDGE
 ) -> tuple[Array, Array]:
     """Return the inverse of an information, and a bound of its root's condition number.
 
@@ -98,7 +98,7 @@ def inverse_information(
     squares = jnp.diagonal(information)
     scale = 1.0 / jnp.sqrt(jnp.where(squares > 0, squares, 1.0))
     scaled_matrix = scale[:, None] * information * scale[None]
-    L = jnp.linalg.cholesky(scaled_matrix + RIDGE * np.eye(size))
+    L = jnp.linalg.cholesky(scaled_matrix + ridge * np.eye(size))
     scaled_root = jax.lax.linalg.triangular_solve(
         L,
         jnp.eye(size),

@@ -1,6 +1,6 @@
 """Uncertainty of estimates: spectral sandwich, block jackknife, residual spectra."""
 
-from .blocks import BlockJackknife as BlockJackknife
+from .blocks import BlockJackknife as BlockJackknife, bootstrap as bootstrap
 from .result import (
     AbstractUncertainty as AbstractUncertainty,
     IndependentRows as IndependentRows,

@@ -1,12 +1,30 @@
-"""Uncertainty from contiguous blocks of time: the jackknife."""
+"""Uncertainty from contiguous blocks of time: jackknife and bootstrap."""
 
 from collections.abc import Sequence
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, BaseVector, Matrix, Vector
+from jaxid.arrays import (
+    AnyArray,
+    Array,
+    BaseVector,
+    Float,
+    Joints,
+    Matrix,
+    PRNGKeyArray,
+    Vector,
+    require_float64,
+)
+from jaxid.errors import InputError
 
 from ..estimators.estimate import Estimate
+from ..estimators.regularisation_and_weights import (
+    RIDGE,
+    Decomposition,
+    inverse_information,
+)
 from ..factors import Blocks
 from .result import AbstractUncertainty, Uncertainty, rescale_covariance
 
@@ -94,3 +112,60 @@ def block_covariance(
     dof = len(steps) - 1.0
     changes = np.array(steps) - np.mean(steps, axis=0)
     return dof / len(steps) * changes.T @ changes, dof
+
+
+def bootstrap(
+    blocks: Blocks, weights: Joints, draws: int, key: PRNGKeyArray
+) -> Float[Array, "draws base"]:
+    r"""Return estimates from blocks of time that are drawn with replacement.
+
+    Blocks are drawn, not samples, because errors of neighbouring samples are
+    correlated. The information of a draw is the sum of the blocks' information, each
+    times the number of its occurrences; the weights stay.
+
+    Args:
+        blocks: Factors of some dozens of blocks, each longer than the correlation of
+            the errors.
+        weights: Weights of the joints' rows [1/(N m) or 1/N], such as `fit.weights`.
+        draws: Number of draws.
+        key: Key of the random numbers.
+
+    Returns:
+        Parameters of each draw; their covariance is that of the estimates.
+
+    Raises:
+        InputError: If there are fewer than two blocks, or draws do not determine all
+            parameters.
+        RuntimeError: If JAX's 64-bit mode is off.
+    """
+    require_float64("a bootstrap")
+    count = len(blocks.parts)
+    if count < 2:
+        raise InputError(
+            "`blocks` must hold at least two blocks of time, but holds one."
+        )
+    decomposition = Decomposition.of(*blocks.total.weighted(weights))
+    start = decomposition.solve()
+    scale = decomposition.scale
+    # Products of the blocks' rows, as if all columns had length one.
+    information = []
+    gradients = []
+    for R, residuals in residual_blocks(blocks, weights, start):
+        rows = R / scale
+        information.append(rows.T @ rows)
+        gradients.append(rows.T @ residuals)
+
+    numbers = jax.random.randint(key, (draws, count), 0, count)
+    is_drawn = np.asarray(numbers)[:, :, None] == np.arange(count)
+    occurrences = is_drawn.sum(axis=1).astype(float)
+    total = np.tensordot(occurrences, np.array(information), 1)
+    inverse, condition = jax.vmap(inverse_information)(jnp.asarray(total))
+    is_open = ~(np.asarray(condition) < 1 / np.sqrt(RIDGE))
+    if is_open.any():
+        raise InputError(
+            f"{is_open.sum()} of {draws} draws do not determine all parameters: take "
+            "longer `blocks`."
+        )
+    total_gradients = occurrences @ np.array(gradients)
+    steps = np.einsum("dij,dj->di", np.asarray(inverse), total_gradients)
+    return jnp.asarray(start + steps / scale)
