@@ -2,12 +2,12 @@
 
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Self
 
-from .process import Farewell
+from .process import farewells
 
 
-class BestResult(Farewell):
+class BestResult:
     """The best result of a search so far, in its files.
 
     Within its context, a signal that ends the process says where they are.
@@ -27,6 +27,13 @@ class BestResult(Farewell):
         self._sentence = sentence
         self._excuse = excuse
         self._is_writing = False
+
+    def __enter__(self) -> Self:
+        farewells.append(self.farewell)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        farewells.pop()
 
     def keep(self, result: Any) -> None:
         """Write a better result."""

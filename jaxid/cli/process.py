@@ -15,25 +15,10 @@ import sys
 import threading
 import traceback
 from collections.abc import Callable
-from typing import NoReturn, Self
+from typing import NoReturn
 
 farewells: list[Callable[[], str]] = []
 """Functions that say what a command has written when a signal ends it."""
-
-
-class Farewell:
-    """Context in which a signal that ends the process says what is written."""
-
-    def __enter__(self) -> Self:
-        farewells.append(self.farewell)
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        farewells.pop()
-
-    def farewell(self) -> str:
-        """Return the sentence with which Ctrl-C ends the command."""
-        raise NotImplementedError
 
 
 class _SignalReceived(BaseException):

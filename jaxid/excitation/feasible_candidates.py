@@ -7,6 +7,7 @@ import numpy as np
 from jaxid.arrays import AnyArray, Float, namespace
 
 from .coefficient_limits import Grid, ScaledMotion, ScaledMotions
+from .criterion_gradient import criterion_at_samples
 from .problem import MAX_COARSE_EXCESS, ExcitationProblem
 
 PerStart = Float[AnyArray, " starts"]
@@ -98,15 +99,10 @@ class Candidates(NamedTuple):
 
 def criterion_values(problem: ExcitationProblem, x: ScaledMotions) -> PerStart:
     """Return the exact logarithms of the criterion."""
-    values = []
-    for motion in x:
-        information = problem.information(motion)
-        # The function that a search compiles in any case.
-        value, _ = problem.criterion_and_slopes(
-            information.plain, information.weighted, None
-        )
-        values.append(float(value))
-    return np.array(values)
+    samples = problem.samples
+    # One by one: all samples of many motions take much memory.
+    values = [criterion_at_samples(problem, y[None], None, samples) for y in x]
+    return np.concatenate(values)
 
 
 def evaluate(problem: ExcitationProblem, x: ScaledMotions) -> Candidates:

@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import Texts, Vector
+from jaxid.arrays import AnyArray, Texts, Vector
 from jaxid.errors import InputError
 from jaxid.identification.consistency import consistency_margin
 from jaxid.identification.fit_result import Fit
@@ -195,31 +195,28 @@ def _require_same_robot(robot: Robot, file_robot: Robot, source: FilePath) -> No
             f"but the fit has {', '.join(robot.body_names)}: "
             "give the file of this robot, or its `tip`."
         )
-    if robot.followers != file_robot.followers:
-        raise InputError(
-            f"`{source}` does not have the same relations between joints (`<mimic>`) "
-            "as the robot of the fit: give the file of that robot."
-        )
-    for joint, name in enumerate(robot.joint_names):
-        if robot.revolute[joint] != file_robot.revolute[joint]:
-            words = "turns" if file_robot.revolute[joint] else "slides"
-            raise InputError(
-                f"joint `{name}` {words} in `{source}`, but not in the robot of the "
-                "fit: give the file of that robot."
-            )
     # How the robot is mounted on a sensor is not in the file, either.
     is_on_body = np.array(robot.parent) >= (GROUP if robot.has_base_sensor else 0)
-    for quantity in ("axis", "rotation", "offset"):
-        fit_numbers = np.asarray(getattr(robot, quantity))
-        file_numbers = np.asarray(getattr(file_robot, quantity))
-        deviations = np.abs(fit_numbers - file_numbers)
-        if quantity != "axis":
-            deviations = deviations[is_on_body]
-        if deviations.max(initial=0.0) > MAX_DEVIATION:
+    is_everywhere = np.ones_like(is_on_body)
+    differences = {
+        "relations between joints (`<mimic>`)": robot.followers != file_robot.followers,
+        "kinds of joints": robot.revolute != file_robot.revolute,
+        "axes": _differ(robot.axis, file_robot.axis, is_everywhere),
+        "attitudes of joints": _differ(robot.rotation, file_robot.rotation, is_on_body),
+        "places of joints": _differ(robot.offset, file_robot.offset, is_on_body),
+    }
+    for quantity, is_different in differences.items():
+        if is_different:
             raise InputError(
-                f"`{source}` has a different `{quantity}` from the robot of the fit: "
+                f"`{source}` has other {quantity} than the robot of the fit: "
                 "give the file of that robot."
             )
+
+
+def _differ(x: AnyArray, y: AnyArray, mask: np.ndarray) -> bool:
+    """Return whether two arrays differ by more than rounding, where the mask says."""
+    deviations = np.abs(np.asarray(x) - np.asarray(y))[mask]
+    return bool(deviations.max(initial=0.0) > MAX_DEVIATION)
 
 
 def _inertial(p: Vector) -> Any:

@@ -277,14 +277,14 @@ def test_a_urdf_of_another_robot_is_refused(fit, source, tmp_path):
     with pytest.raises(ValueError, match="has the joints rail, shoulder, knee"):
         jid.export_urdf(fit, source, tmp_path / "arm.urdf")
     source.write_text(URDF.replace("0 0.3 0", "0 0.4 0"), "utf-8")
-    with pytest.raises(ValueError, match="`offset`"):
+    with pytest.raises(ValueError, match="other places of joints"):
         jid.export_urdf(fit, source, tmp_path / "arm.urdf")
     sliding = URDF.replace(
         'name="elbow" type="revolute"', 'name="elbow" type="prismatic"'
     )
     assert sliding != URDF
     source.write_text(sliding, "utf-8")
-    with pytest.raises(ValueError, match="joint `elbow` slides in"):
+    with pytest.raises(ValueError, match="other kinds of joints"):
         jid.export_urdf(fit, source, tmp_path / "arm.urdf")
     assert not (tmp_path / "arm.urdf").exists()
 
