@@ -8,14 +8,14 @@ whole search in NumPy.
 import time
 from collections.abc import Callable, Generator
 from functools import partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray, Array
+from jaxid.arrays import Array
 
 from . import interior_point, search
 from .coefficient_limits import ScaledMotions
@@ -32,12 +32,12 @@ NOT, BY_PLACE, BY_VALUE = range(3)
 
 
 class Plan(NamedTuple):
-    """All parts of a search, as arrays with one entry for each."""
+    """One part of a search; or all parts, as arrays with one entry for each."""
 
     stage: Stage
-    origin: AnyArray  # motions with which it begins
-    comparison: AnyArray  # how its motions are compared with the best so far
-    generation: AnyArray  # number of the matings of its children
+    origin: Any  # motions with which it begins
+    comparison: Any  # how its motions are compared with the best so far
+    generation: Any  # number of the matings of its children
 
 
 class State(NamedTuple):
@@ -112,28 +112,25 @@ def compiled_search(
 
 def plan_parts(problem: ExcitationProblem, generations: int) -> Plan:
     """Return all parts: the schedule, generations of children, and a last stage."""
-    runs = []
+    parts = []
     for stage in search.schedule_of(problem):
         # With relaxed limits a motion is not yet a result.
         comparison = BY_PLACE if stage.bound < 1.0 else NOT
-        runs.append((stage, KEEP, comparison, 0))
+        parts += _parts_of_stage(stage, KEEP, comparison)
     for generation in range(generations):
-        runs.append((search.GENERATION_STAGE, BREED, BY_VALUE, generation))
-    runs.append((search.FINE_STAGE, RESUME, BY_PLACE, 0))
+        parts += _parts_of_stage(search.GENERATION_STAGE, BREED, BY_VALUE, generation)
+    parts += _parts_of_stage(search.FINE_STAGE, RESUME, BY_PLACE)
+    return jax.tree.map(lambda *numbers: np.array(numbers), *parts)
 
-    stages = []
-    other_fields = []
-    for stage, origin, comparison, generation in runs:
-        parts = search.split_stage(stage)
-        for number, part in enumerate(parts):
-            is_last = number == len(parts) - 1
-            part_origin = KEEP if number else origin
-            part_comparison = comparison if is_last else NOT
-            stages.append(part)
-            other_fields.append((part_origin, part_comparison, generation))
-    columns = (np.array(column) for column in zip(*stages, strict=True))
-    others = (np.array(column) for column in zip(*other_fields, strict=True))
-    return Plan(Stage(*columns), *others)
+
+def _parts_of_stage(
+    stage: Stage, origin: int, comparison: int, generation: int = 0
+) -> list[Plan]:
+    """Return the parts of a stage: its motions are compared after the last one."""
+    parts = [Plan(part, KEEP, NOT, generation) for part in search.split_stage(stage)]
+    parts[0] = parts[0]._replace(origin=origin)
+    parts[-1] = parts[-1]._replace(comparison=comparison)
+    return parts
 
 
 def draw_generations(
@@ -146,7 +143,7 @@ def draw_generations(
     draws = [
         search.draw_matings(problem, starts, random) for _ in range(max(generations, 1))
     ]
-    return Mating(*(np.stack(parts) for parts in zip(*draws, strict=True)))
+    return jax.tree.map(lambda *choices: np.stack(choices), *draws)
 
 
 def begin(problem: ExcitationProblem, x: Array) -> State:

@@ -88,21 +88,14 @@ class _Round(NamedTuple):
 
 def _one_round(described_log: DescribedLog, seconds: float) -> _Round:
     """Return what remains if a delay is removed."""
-    rows = _rows_without_delay(described_log, seconds)
+    joints = tuple(range(described_log.robot.joints))
+    rows = described_log.with_earlier_forces(joints, seconds)
     fit = described_log.judge.fit(rows)
     equations = _equations(described_log, rows, fit)
     *_, remaining_delay = _solution(_products(equations))
     step = float(np.clip(remaining_delay, -MAX_STEP, MAX_STEP))
     square_misfits = fit.squares / (np.mean(rows.forces**2, axis=0) + 1e-300)
     return _Round(equations, step, float(np.sqrt(np.mean(square_misfits))))
-
-
-def _rows_without_delay(described_log: DescribedLog, seconds: float) -> Rows:
-    """Return the rows of a log whose forces stand earlier."""
-    if seconds == 0.0:
-        return described_log.rows
-    joints = tuple(range(described_log.robot.joints))
-    return described_log.with_earlier_forces(joints, seconds)
 
 
 def _equations(described_log: DescribedLog, rows: Rows, fit: RowFit) -> np.ndarray:
