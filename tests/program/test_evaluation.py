@@ -122,3 +122,17 @@ def test_python_returns_floats_and_raises_its_own_errors():
     assert to_python(trace(lambda x: x, (0,)))([]) == ()
     with pytest.raises(ZeroDivisionError):
         to_python(trace(lambda x: 1.0 / x, ()))([0.0])
+
+
+@pytest.mark.parametrize("limit", [1e-3, 0.8, 7.0, 1e5, 1e9])
+def test_sines_and_cosines_in_numpy_are_exact_to_two_last_bits(limit):
+    program = trace(lambda x: (jnp.sin(x), jnp.cos(x), 2.0 * jnp.sin(x)), ())
+    quarter_turns = np.array([1, 2, 3, 4, 5, 6, 63661]) * (np.pi / 4)
+    random = np.random.default_rng(0).uniform(-limit, limit, 20000)
+    x = np.concatenate([[0.0, -0.0], quarter_turns, -quarter_turns, random])
+    sine, cosine, double = evaluate(program, x)
+    # The library's own are exact to half a bit.
+    np.testing.assert_allclose(sine, np.sin(x), atol=3e-16, rtol=3e-16)
+    np.testing.assert_allclose(cosine, np.cos(x), atol=3e-16, rtol=0)
+    np.testing.assert_array_equal(double, 2.0 * sine)
+    np.testing.assert_array_equal([sine[0], cosine[0]], [0.0, 1.0])
