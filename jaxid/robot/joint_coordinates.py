@@ -16,6 +16,7 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy
 
 from jaxid.arrays import (
     AnyArray,
@@ -197,13 +198,18 @@ def closed_coordinates(robot: Any, q: Joints) -> AnyArray:
     """Return the coordinates of all joints of one sample, where the loops are closed.
 
     The motors go to their coordinates in equal parts, and the loops follow: so they
-    stay on their branch. Where no loops close, they are open: see `loop_closure`.
+    stay on their branch. A program cannot do more where a part is too large: rows of
+    samples are closed by `closed_samples`.
     """
     change = change_of_motors(robot, q)
 
     def step(k, moved):
-        others = coordinates_on_way(robot, q, change, (k + 1) / PARTS_OF_WAY)
-        return moved + newton_step(robot, jnp.concatenate([others, moved]))
+        # Behind the way these are exactly those of `q`, whose sines and cosines a
+        # program computes once.
+        rest = 1.0 - jnp.minimum((k + 1) / PARTS_OF_WAY, 1.0)
+        others = linear_coordinates(robot.followers, q - rest * change)
+        change_of_moved = newton_step(robot, jnp.concatenate([others, moved]))
+        return moved + jnp.clip(change_of_moved, -MAX_CHANGE, MAX_CHANGE)
 
     pose = jnp.asarray(robot.loop_pose, q.dtype)
     moved = pose[-len(robot.loop_rows) :]
@@ -217,7 +223,9 @@ def change_of_motors(robot: Any, q: ManyJoints) -> AnyArray:
     xp = namespace(q)
     pose = xp.asarray(robot.loop_pose, q.dtype)[: robot.joints]
     change = q - xp.broadcast_to(pose, q.shape)
-    if robot.bodies > robot.joints + len(robot.loop_rows):
+    has_led_followers = robot.bodies > robot.joints + len(robot.loop_rows)
+    is_within_turn = xp is np and bool((abs(change) <= np.pi).all())
+    if has_led_followers or is_within_turn:
         return change
     # A full turn of a motor changes nothing, if no joint follows it by a ratio.
     turn = xp.arctan2(xp.sin(change), xp.cos(change))
@@ -225,39 +233,10 @@ def change_of_motors(robot: Any, q: ManyJoints) -> AnyArray:
     return xp.where(is_revolute, turn, change)
 
 
-def coordinates_on_way(
-    robot: Any, q: ManyJoints, change: AnyArray, share: Any
-) -> AnyArray:
-    """Return all coordinates but those of loops after a share of the motors' way.
-
-    Behind the way these are exactly those of `q`, whose sines and cosines a program
-    computes once.
-    """
-    xp = namespace(q, share)
-    rest = 1.0 - xp.minimum(share, 1.0)
-    return linear_coordinates(robot.followers, q - rest * change)
-
-
 def newton_step(robot: Any, coordinates: Joints) -> Array:
     """Return the changes of the joints that loops move, which close them."""
     _, slopes = gap_slopes(robot, coordinates)
-    change = solve_columns(slopes, -closing_rows(robot, coordinates))
-    return _limited(change, MAX_CHANGE)
-
-
-def chebyshev_step(robot: Any, coordinates: Joints) -> Array:
-    """Return these changes to third order: with the curvature along Newton's step."""
-    step = newton_step(robot, coordinates)
-    _, slopes = gap_slopes(robot, coordinates)
-    others = robot.bodies - len(step)
-    curvature = _gap_curvature(robot, coordinates, jnp.pad(step, (others, 0)))
-    correction = solve_columns(slopes, curvature) / 2
-    return step - _limited(correction, jnp.sqrt(step @ step) / 2)
-
-
-def _limited(change: Array, limit: Any):
-    """Return changes of joints that are not too large."""
-    return jnp.minimum(jnp.maximum(change, -limit), limit)
+    return solve_columns(slopes, -closing_rows(robot, coordinates))
 
 
 def _gap_curvature(robot: Any, coordinates: Joints, rates: Joints):
@@ -268,27 +247,6 @@ def _gap_curvature(robot: Any, coordinates: Joints, rates: Joints):
         return jax.jvp(gaps, (coordinates,), (rates,))[1]
 
     return jax.jvp(gap_rates, (coordinates,), (rates,))[1]
-
-
-def extrapolated_coordinates(robot: Any, change: Joints) -> AnyArray:
-    """Return those of all joints to third order around the robot's `loop_pose`."""
-    pose = jnp.asarray(robot.loop_pose, change.dtype)
-    closed_robot, start = at_sample(robot, pose)
-    rates = all_rates(closed_robot, start, change)
-    standstill = jnp.zeros_like(change)
-    curvature = all_accelerations(closed_robot, start, change, standstill)
-
-    def derivative(gaps):
-        return lambda t: jax.jvp(gaps, (t,), (jnp.ones_like(t),))[1]
-
-    def gaps_on_way(t):
-        return closing_rows(robot, pose + t * rates + t * t * curvature / 2)
-
-    gap_jerk = derivative(derivative(derivative(gaps_on_way)))(jnp.zeros_like(pose[0]))
-    _, slopes = gap_slopes(robot, pose)
-    jerk = solve_columns(slopes, -gap_jerk)
-    others = robot.bodies - len(jerk)
-    return pose + rates + curvature / 2 + jnp.pad(jerk, (others, 0)) / 6
 
 
 @jax.custom_jvp
@@ -360,47 +318,59 @@ def _solve_by_cofactors(A: Array, b: Array):
 def loop_closure(robot: Any, coordinates: Joints) -> Array:
     """Return the square of the distance by which loops are open [m²], and a share.
 
-    The share is the determinant of the slopes by the joints that loops move, relative
-    to that at the robot's `loop_pose`: zero where the loops are singular, negative on
-    another branch.
+    The share is the least determinant of the slopes by the joints that loops move, of
+    all blocks of joints that can be closed one after the other, relative to that at the
+    robot's `loop_pose`: zero where the loops are singular, negative on another branch.
     """
     gaps = loop_gaps(robot, coordinates)
     pose = jnp.asarray(robot.loop_pose, coordinates.dtype)
-    share = _determinant(robot, coordinates) / _determinant(robot, pose)
-    return jnp.stack([gaps @ gaps, share])
-
-
-def _determinant(robot: Any, coordinates: Joints):
-    """Return the determinant of the slopes by the joints that loops move.
-
-    It is expanded along the rows. Each of them has slopes by the joints of one loop
-    only, so that few minors differ from zero.
-    """
     _, slopes = gap_slopes(robot, coordinates)
-    joints = _moved_joints_of_rows(robot)
+    _, pose_slopes = gap_slopes(robot, pose)
+    shares = [
+        _determinant(slopes, block) / _determinant(pose_slopes, block)
+        for block in _blocks(robot)
+    ]
+    return jnp.stack([gaps @ gaps, functools.reduce(jnp.minimum, shares)])
+
+
+Block = dict[int, set[int]]
+"""Rows of a matrix, and for each of them the columns that are not zero."""
+
+
+def _determinant(slopes: Array, block: Block):
+    """Return the determinant of a block, by minors of its first rows."""
     minors: dict[frozenset[int], Any] = {frozenset(): 1.0}
-    for row, columns in enumerate(joints):
-        in_later_rows = set().union(*joints[row + 1 :])
-        needed = set(range(len(joints))) - in_later_rows
+    for row, columns in block.items():
         larger_minors: dict[frozenset[int], Any] = {}
         for minor, value in minors.items():
             for column in columns - minor:
                 key = minor | {column}
-                if not key >= needed:
-                    continue
                 swaps = sum(other > column for other in minor)
                 term = (-1.0) ** swaps * slopes[row, column] * value
                 larger_minors[key] = larger_minors.get(key, 0.0) + term
         minors = larger_minors
-    return minors[frozenset(range(len(joints)))]
+    return minors[frozenset().union(*block.values())]
 
 
-def _moved_joints_of_rows(robot: Any):
-    """Return for each of `closing_rows` the joints that its loop moves."""
-    others = robot.bodies - len(robot.loop_rows)
-    joints = []
-    for row in robot.loop_rows:
-        loop = robot.loops[row // 3]
-        bodies = bodies_in_loop(robot.parent, loop.bodies)
-        joints.append({body - others for body in bodies if body >= others})
-    return joints
+def _blocks(robot: Any) -> list[Block]:
+    """Return the diagonal blocks of the slopes by the joints that loops move.
+
+    Each of `closing_rows` has slopes by the joints of one loop only. In a suitable
+    order of rows and columns, what stands on one side of these blocks is zero.
+    """
+    count = len(robot.loop_rows)
+    is_slope = np.zeros((count, robot.bodies), bool)
+    for row, entry in enumerate(robot.loop_rows):
+        bodies = bodies_in_loop(robot.parent, robot.loops[entry // 3].bodies)
+        is_slope[row, list(bodies)] = True
+    graph = scipy.sparse.csr_array(is_slope[:, -count:])
+    columns = scipy.sparse.csgraph.maximum_bipartite_matching(graph, "column")
+    _, labels = scipy.sparse.csgraph.connected_components(
+        graph[:, columns], connection="strong"
+    )
+    blocks: dict[int, Block] = {}
+    for row, label in enumerate(labels):
+        in_block = set(columns[labels == label].tolist())
+        block = blocks.setdefault(label, {})
+        block[row] = in_block.intersection(graph[[row]].indices.tolist())
+    return list(blocks.values())

@@ -16,9 +16,11 @@ from jaxid.program import evaluate, trace
 
 from .follower_joints import Follower, Loop, bodies_in_loop
 from .joint_coordinates import (
+    LAST_STEPS,
     linear_coordinates,
     linear_ratios,
     loop_gaps,
+    newton_step,
     with_leader,
 )
 from .limits_and_drives import listed, of_joints
@@ -157,7 +159,11 @@ def assembled(robot: Robot, poses: Sequence[AnyArray]) -> Robot:
     slopes = _of_pose(jax.jacfwd(lambda q: loop_gaps(robot, q)), pose)
     rows = _independent_rows(robot, slopes, moved)
     robot = robot.replace(loop_rows=rows, loop_pose=pose)
-    return robot.replace(loop_pose=robot.close(pose[: robot.joints]))
+    change = functools.partial(newton_step, robot)
+    for _ in range(LAST_STEPS):
+        others, joints = np.split(pose, [-moved])
+        pose = np.concatenate([others, joints + _of_pose(change, pose)])
+    return robot.replace(loop_pose=pose)
 
 
 def _closed(

@@ -1,10 +1,12 @@
-"""Closed loops of many samples: Newton's steps in NumPy, or compiled.
+"""Closed loops of samples: Newton's steps on the way of the motors, in NumPy or JAX.
 
-One step is one short program. Where all samples are closed soon, few steps are made.
+Motors go from the robot's `loop_pose` to their coordinates in parts, and the loops
+follow. A part that Newton's steps do not close as they do near a regular pose is halved
+(Deuflhard, Newton Methods for Nonlinear Problems, 2011, chapter 5): so no step jumps
+over a singular pose, behind which loops may close on another branch.
 """
 
-from collections.abc import Callable
-from typing import Any
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -22,191 +24,233 @@ from jaxid.arrays import (
     namespace,
 )
 from jaxid.errors import InputError
-from jaxid.program.sample_methods import in_numpy, on_samples, program_of
-from jaxid.program.xla_sample_blocks import on_rows
+from jaxid.program.sample_methods import evaluate_samples
 
 from .joint_coordinates import (
-    LAST_STEPS,
-    PARTS_OF_WAY,
+    all_rates,
     change_of_motors,
-    chebyshev_step,
-    closed_coordinates,
-    coordinates_on_way,
-    extrapolated_coordinates,
     linear_coordinates,
     loop_closure,
+    newton_step,
     with_loop_rates,
 )
 
 MAX_GAP = {"float64": 1e-6, "float32": 1e-4}
-"""Distance between points of a loop up to which a last step closes it, by precision.
-
-The error is its third power [m]; near singular poses the limit is in proportion.
-"""
+"""Distance between points of a loop [m] from which a last step closes it."""
 MIN_CLOSING_SHARE = 1e-4
 """Determinant of closing relative to that of the description; below, it is singular."""
 MIN_SAFE_SHARE = 0.2
 """The same for motions that are designed or drawn."""
-STEPS_AT_ONCE = 2
+STEPS_AT_ONCE = 4
 """Steps of one program, in which sines and cosines of motors are computed once."""
-MAX_WAY_AT_ONCE = 1.0
-"""Way of a motor from the robot's `loop_pose` up to which it is used [rad or m]."""
-PARTS_OF_RANDOM_WAY = 24
-"""Points on the way to random coordinates at which it is checked."""
 
 
-PARTS = (0, PARTS_OF_WAY, 6 * PARTS_OF_WAY)
-"""Parts of the motors' way from the robot's `loop_pose`, with one step each.
+class WayLimits(NamedTuple):
+    """Limits of the parts of the motors' way.
 
-If 0, the loops start where they would be if their coordinates were cubic functions of
-the motors'. Each number is for samples that the one before does not close.
-"""
+    Attributes:
+        motors: Way of the motors up to which it starts with one part [rad or m].
+        prediction: Change of the joints that loops move which is trusted [rad or m].
+        correction: Largest ratio of the first step to this change.
+        contraction: Largest ratio of each step to the one before it; theory ends at 1/2
+            (Deuflhard).
+        part: Share of the way that is not halved again.
+        rounding: Size of steps that are rounding [rad or m].
+    """
+
+    motors: float = 1.5
+    prediction: float = 1.0
+    correction: float = 0.8
+    contraction: float = 0.5
+    part: float = 1 / 1024
+    rounding: float = 1e-9
+
+
+LIMITS = WayLimits()
+
+
+class Progress(NamedTuple):
+    """How far the loops of one sample have followed the motors.
+
+    Attributes:
+        moved: Coordinates of the joints that loops move, while they are being closed.
+        limit: Limit of the square of the next step.
+        part: Share of the way that the motors go next, at most to its end.
+        rate: Derivatives of `origin` by the share of the way.
+        origin: Coordinates of these joints where the loops were closed last.
+        reached: Share of the way there.
+    """
+
+    moved: AnyArray
+    limit: AnyArray
+    part: AnyArray
+    rate: AnyArray
+    origin: AnyArray
+    reached: AnyArray
+
+    @classmethod
+    def at_part(
+        cls, origin: Joints, rate: Joints, reached: AnyArray, part: AnyArray
+    ) -> "Progress":
+        """Return the progress at the beginning of a part of the way."""
+        prediction = jnp.minimum(part, 1.0 - reached) * rate
+        square = jnp.minimum(prediction @ prediction, LIMITS.prediction**2)
+        limit = LIMITS.correction**2 * square
+        return cls(origin + prediction, limit, part, rate, origin, reached)
+
+    @classmethod
+    def of(cls, numbers: Array) -> "Progress":
+        """Read the numbers of `packed`."""
+        joints = len(numbers) // 3 - 1
+        rate, origin = jnp.split(numbers[joints + 2 : -1], 2)
+        limit, part = numbers[joints : joints + 2]
+        return cls(numbers[:joints], limit, part, rate, origin, numbers[-1])
+
+    @property
+    def packed(self) -> Array:
+        """All numbers, one after the other."""
+        return jnp.concatenate([jnp.atleast_1d(x) for x in self])
 
 
 class Closure(eqx.Module):
-    """Closing of the loops of a robot.
+    """Closing of the loops of a robot, up to poses that are nearly singular.
 
-    Results are the coordinates of all joints and their `loop_closure`.
+    Attributes:
+        robot: Robot with loops.
+        min_share: Least determinant relative to that of the robot's `loop_pose`.
+        max_gap: Distance between points of a loop from which a last step closes it [m],
+            relative to this determinant. The error is about its square.
     """
 
     robot: Any
+    min_share: float = eqx.field(static=True, default=MIN_CLOSING_SHARE)
+    max_gap: float = eqx.field(static=True, default=MAX_GAP["float64"])
 
-    def of_sample(self, q: Joints) -> Array:
-        """Close the loops of one sample."""
-        coordinates = closed_coordinates(self.robot, q)
-        return jnp.concatenate([coordinates, loop_closure(self.robot, coordinates)])
+    def start(self, change: Joints) -> Array:
+        """Return the progress of one sample at the robot's `loop_pose`."""
+        joints = len(self.robot.loop_rows)
+        pose = jnp.asarray(self.robot.loop_pose, change.dtype)
+        rate = all_rates(self.robot, pose, change)[-joints:]
+        way = jnp.sqrt(change @ change)
+        part = 1.0 / jnp.maximum(way / LIMITS.motors, 1.0)
+        return Progress.at_part(pose[-joints:], rate, 0.0 * part, part).packed
 
-    def start(self, change: Joints) -> AnyArray:
-        """Return the joints that loops move, extrapolated from `loop_pose`."""
-        coordinates = extrapolated_coordinates(self.robot, change)
-        return coordinates[-len(self.robot.loop_rows) :]
+    def step(self, q: Joints, change: Joints, numbers: Array) -> Array:
+        """Return the progress of one sample after one of Newton's steps."""
+        progress = Progress.of(numbers)
+        rest = jnp.maximum(1.0 - progress.reached - progress.part, 0.0)
+        others = linear_coordinates(self.robot.followers, q - rest * change)
+        coordinates = jnp.concatenate([others, progress.moved])
+        step = newton_step(self.robot, coordinates)
+        moved = progress.moved + step
+        square, share = loop_closure(self.robot, coordinates)
+        max_gap = self.max_gap * jnp.maximum(share, self.min_share)
+        is_closed = square <= max_gap**2
+        is_on_way = ~is_closed & (step @ step < progress.limit)
+        next_limit = LIMITS.contraction**2 * (step @ step)
+        on_way = progress._replace(moved=moved, limit=next_limit)
 
-    def step(self, others: Joints, moved: Joints) -> Array:
-        """Return these joints after a step, and the closure before it."""
+        # A part at whose end the loops close is followed by a longer one; others are
+        # halved.
+        has_arrived = is_closed & (share > self.min_share)
+        rate = all_rates(self.robot, coordinates, change)[-len(moved) :]
+        next_part = Progress.at_part(
+            jnp.where(has_arrived, moved, progress.origin),
+            jnp.where(has_arrived, rate, progress.rate),
+            jnp.where(has_arrived, 1.0 - rest, progress.reached),
+            jnp.where(has_arrived, 2.0, 0.5) * progress.part,
+        )
+        return jnp.where(is_on_way, on_way.packed, next_part.packed)
+
+    def at_once(self, q: Joints, change: Joints) -> Array:
+        """Return the joints that loops move after `STEPS_AT_ONCE` steps, and 1.
+
+        The 1 is a 0 where the way has several parts, or where the steps fail.
+        """
+        progress = Progress.of(self.start(change))
+        others = linear_coordinates(self.robot.followers, q)
+        moved = progress.moved
+        limit = progress.limit
+        are_regular = progress.part == 1.0
         coordinates = jnp.concatenate([others, moved])
-        moved = moved + chebyshev_step(self.robot, coordinates)
-        return jnp.concatenate([moved, loop_closure(self.robot, coordinates)])
-
-    def at_once(self, q: Joints) -> Array:
-        """Close the loops of one sample near `loop_pose`."""
-        robot = self.robot
-        moved = self.start(q - robot.loop_pose[: robot.joints])
-        others = linear_coordinates(robot.followers, q)
-        values = moved
         for _ in range(STEPS_AT_ONCE):
-            values = self.step(others, values[: len(moved)])
-        return jnp.concatenate([others, values])
-
-    def of_samples(self, q: ManyJoints) -> AnyArray:
-        """Close the loops of many samples; in float64 for NumPy's arrays."""
-        rows: Any = q.reshape(-1, self.robot.joints)
-        if isinstance(q, np.ndarray):
-            values = self._in_numpy(rows)
-        elif is_traced(self.robot):
-            values = on_samples(self, self.of_sample, rows)
-        else:
-            values = self._in_jax(rows)
-        return values.reshape(*q.shape[:-1], -1)
-
-    def next_on_way(self, q: np.ndarray, values: AnyArray) -> AnyArray:
-        """Close the loops of rows, from values of rows near them."""
-        return self._attempted(0, q, values)
-
-    def _in_numpy(self, q: np.ndarray) -> np.ndarray:
-        """Close the loops of rows, in each attempt those that are still open."""
-        values = in_numpy(self, self.at_once, q)
-        is_near = self._is_near(q)
-        are_closed = is_near & is_closed(values)
-        for parts in PARTS:
-            remaining = ~are_closed if parts else is_near & ~are_closed
-            if not remaining.any():
-                continue
-            rows = self._attempted(parts, q[remaining], values[remaining])
-            values[remaining] = rows
-            are_closed[remaining] = is_closed(rows)
-        return values
-
-    def _in_jax(self, q: Array) -> Array:
-        """Close the loops of rows, in each attempt those of all of them."""
-
-        def is_open(state):
-            number, _, are_closed = state
-            return (number < len(PARTS)) & ~are_closed.all()
-
-        def attempt(state):
-            number, values, are_closed = state
-            parts = jnp.array(PARTS)[number]
-            rows = self._attempted(parts, constant_q, values)
-            values = jnp.where(are_closed[:, None], values, rows)
-            is_on_branch = is_near | (parts > 0)
-            return number + 1, values, is_closed(values) & is_on_branch
-
-        constant_q = jax.lax.stop_gradient(q)
-        is_near = self._is_near(constant_q)
-        others = linear_coordinates(self.robot.followers, constant_q)
-        moved = self._evaluated(self.start, self._way(constant_q))
-        unknown_closure = jnp.full((len(q), 2), jnp.nan, q.dtype)
-        values = jnp.concatenate([others, moved, unknown_closure], axis=1)
-        state = (0, values, jnp.zeros(len(q), bool))
-        _, values, _ = jax.lax.while_loop(is_open, attempt, state)
-        derivable = jax.vmap(with_loop_rates, (None, 0, 0))
-        coordinates, closure = jnp.split(values, [self.robot.bodies], axis=1)
-        coordinates = derivable(self.robot, q, coordinates)
-        return jnp.concatenate([coordinates, closure], axis=1)
-
-    def _way(self, q: ManyJoints):
-        """Return how far motors of rows are from `loop_pose`."""
-        pose = namespace(q).asarray(self.robot.loop_pose, q.dtype)
-        return q - pose[None, : self.robot.joints]
-
-    def _is_near(self, q: ManyJoints):
-        """Return whether motors of rows are near `loop_pose`."""
-        return (abs(self._way(q)) <= MAX_WAY_AT_ONCE).all(axis=1)
-
-    def _attempted(self, parts: Any, q: ManyJoints, values: AnyArray):
-        """Close the loops of rows on a way of some parts, or from where they are."""
-        robot = self.robot
-        xp = namespace(q)
-        change = change_of_motors(robot, q)
-        first = robot.bodies - len(robot.loop_rows)
-        pose = xp.asarray(robot.loop_pose, q.dtype)
-        moved = values[:, first : robot.bodies]
-        moved = xp.where(parts == 0, moved, pose[None, first:])
-        unknown_closure = xp.full((len(q), 2), xp.nan, q.dtype)
-
-        def is_unfinished(state):
-            k, rows = state
-            is_open = ~is_closed(rows).all()
-            return (k < parts) | ((k < parts + LAST_STEPS) & is_open)
-
-        def step(state):
-            k, rows = state
-            share = (k + 1) / xp.maximum(parts, 1)
-            others = coordinates_on_way(robot, q, change, share)
-            return k + 1, self._evaluated(self.step, others, rows[:, :-2])
-
-        state = (0, xp.concatenate([moved, unknown_closure], axis=1))
-        if xp is np:
-            while is_unfinished(state):
-                state = step(state)
-        else:
-            state = jax.lax.while_loop(is_unfinished, step, state)
-        others = linear_coordinates(robot.followers, q)
-        return xp.concatenate([others, state[1]], axis=1)
-
-    def _evaluated(self, method: Callable, *arrays: ManyJoints):
-        """Return a method of rows, by its program."""
-        if isinstance(arrays[0], np.ndarray):
-            return in_numpy(self, method, *arrays)
-        shapes = [x.shape[1:] for x in arrays]
-        program = program_of(self, method, *shapes)
-        return on_rows(program, *map(jnp.asarray, arrays))
+            coordinates = jnp.concatenate([others, moved])
+            step = newton_step(self.robot, coordinates)
+            square = step @ step
+            are_regular &= square < jnp.maximum(limit, LIMITS.rounding**2)
+            limit = LIMITS.contraction**2 * square
+            moved = moved + step
+        square, share = loop_closure(self.robot, coordinates)
+        is_closed = square <= (self.max_gap * share) ** 2
+        has_arrived = are_regular & is_closed & (share > self.min_share)
+        return jnp.append(moved, jnp.where(has_arrived, 1.0, 0.0))
 
 
-def is_closed(values: AnyArray, min_share: float = MIN_CLOSING_SHARE) -> AnyArray:
-    """Return whether loops are closed, on the branch of the description."""
-    max_gap = MAX_GAP[values.dtype.name] * values[..., -1]
-    return (values[..., -2] <= max_gap**2) & (values[..., -1] > min_share)
+def follow(closure: Closure, q: ManyJoints, change: ManyJoints) -> AnyArray:
+    """Return the joints that loops move, and the share of the way they follow.
+
+    Args:
+        closure: How loops are closed.
+        q: Coordinates of the motors behind the whole way, in rows.
+        change: Way of the motors to these coordinates.
+    """
+    if isinstance(q, np.ndarray):
+        rows = evaluate_samples(closure, closure.at_once, q, change)
+        remaining = np.flatnonzero(rows[:, -1] < 1.0)
+        if len(remaining):
+            rows[remaining] = _by_parts(closure, q[remaining], change[remaining])
+        return rows
+    return _by_parts(closure, q, change)
+
+
+def _by_parts(closure: Closure, q: ManyJoints, change: ManyJoints) -> Any:
+    """Return the same by one step of all rows after the other."""
+    joints = len(closure.robot.loop_rows)
+    xp = namespace(q)
+
+    def are_unfinished(rows):
+        return (rows[:, -1] < 1.0) & (rows[:, joints + 1] > LIMITS.part)
+
+    def step(rows):
+        next_rows = evaluate_samples(closure, closure.step, q, change, rows)
+        return xp.where(are_unfinished(rows)[:, None], next_rows, rows)
+
+    rows: Any = evaluate_samples(closure, closure.start, change)
+    if xp is np:
+        while are_unfinished(rows).any():
+            rows = step(rows)
+    else:
+        rows = jax.lax.while_loop(lambda x: are_unfinished(x).any(), step, rows)
+    return rows[:, -joints - 1 :]
+
+
+def closed_samples(
+    robot: Any, q: ManyJoints, min_share: float = MIN_CLOSING_SHARE
+) -> tuple[AnyArray, AnyArray]:
+    """Return the coordinates of all joints of samples, and how far loops stay closed.
+
+    This share of the motors' way from the robot's `loop_pose` is 1 where they close.
+    Elsewhere the joints that they move stay where they were closed last. The results
+    are in float64 for NumPy's arrays.
+    """
+    rows: Any = q.reshape(-1, robot.joints)
+    change = change_of_motors(robot, rows)
+    others = linear_coordinates(robot.followers, rows)
+    if isinstance(q, np.ndarray):
+        progress = follow(Closure(robot, min_share), rows, change)
+        coordinates = np.concatenate([others, progress[:, :-1]], axis=1)
+    else:
+        closure = Closure(robot, min_share, MAX_GAP[q.dtype.name])
+        if is_traced(robot):
+            closure = jax.lax.stop_gradient(closure)
+        constants = jax.lax.stop_gradient((rows, change))
+        progress = follow(closure, *constants)
+        open_rows = jnp.concatenate([others, progress[:, :-1]], axis=1)
+        closed_rows = jax.vmap(with_loop_rates, (None, 0, 0))(robot, rows, open_rows)
+        is_closed = progress[:, -1:] == 1.0
+        coordinates = jnp.where(is_closed, closed_rows, open_rows)
+    batch = q.shape[:-1]
+    return coordinates.reshape(*batch, -1), progress[:, -1].reshape(batch)
 
 
 def close_loops(robot: Any, q: Numbers) -> ManyJoints:
@@ -219,16 +263,11 @@ def close_loops(robot: Any, q: Numbers) -> ManyJoints:
         )
     if not robot.loops:
         return linear_coordinates(robot.followers, q)
-    values = Closure(robot).of_samples(q)
-    coordinates = values[..., : robot.bodies]
-    are_closed = is_closed(values)
-    if is_traced(values):
-        return jnp.where(are_closed[..., None], coordinates, jnp.nan)
-    if not np.all(are_closed):
-        sample = int(np.argmin(np.ravel(are_closed)))
-        pose = np.asarray(q).reshape(-1, robot.joints)[sample]
-        distance = float(np.sqrt(np.ravel(values[..., -2])[sample]))
-        raise _open_error(robot, sample, pose, distance)
+    coordinates, reached = closed_samples(robot, q)
+    if is_traced(coordinates):
+        return jnp.where(reached[..., None] == 1.0, coordinates, jnp.nan)
+    if np.any(reached < 1.0):
+        raise _open_error(robot, np.asarray(q), np.ravel(reached))
     return coordinates
 
 
@@ -243,35 +282,28 @@ def reachable(robot: Any, q: np.ndarray) -> np.ndarray:
     """
     if not robot.loops:
         return q
-    closure = Closure(robot)
     start = np.asarray(robot.loop_pose)[: robot.joints]
-    way = (np.asarray(q, np.float64) - start).reshape(-1, robot.joints)
-    shares = np.zeros(len(way))
-    is_reached = np.ones(len(way), bool)
-    values = closure.of_samples(np.broadcast_to(start, way.shape))
-    for part in range(1, PARTS_OF_RANDOM_WAY + 1):
-        share = part / PARTS_OF_RANDOM_WAY
-        points = start + share * way[is_reached]
-        values = closure.next_on_way(points, values)
-        are_safe = is_closed(values, MIN_SAFE_SHARE)
-        values = values[are_safe]
-        is_reached[is_reached] = are_safe
-        shares[is_reached] = share
+    rows = np.asarray(q, np.float64).reshape(-1, robot.joints)
+    way = rows - start
+    progress = follow(Closure(robot, MIN_SAFE_SHARE), rows, way)
+    points = start + progress[:, -1:] * way
     # Robots close their loops on the shortest way, which may be another one.
-    points = start + shares[:, None] * way
-    are_safe = is_closed(closure.of_samples(points), MIN_SAFE_SHARE)
-    return np.where(are_safe[:, None], points, start).reshape(np.shape(q))
+    _, reached = closed_samples(robot, points, MIN_SAFE_SHARE)
+    return np.where(reached[:, None] == 1.0, points, start).reshape(np.shape(q))
 
 
-def _open_error(robot: Any, sample: int, pose: np.ndarray, distance: float):
+def _open_error(robot: Any, q: np.ndarray, reached: np.ndarray):
     """Return the error of a motion whose loops do not close at a sample."""
+    sample = int(np.argmax(reached < 1.0))
+    pose = q.reshape(-1, robot.joints)[sample]
+    last_pose = pose - (1.0 - reached[sample]) * change_of_motors(robot, pose)
     positions = ", ".join(f"{x:.4g}" for x in pose)
+    last_positions = ", ".join(f"{x:.4g}" for x in last_pose)
     loops = ", ".join(f"`{loop.name}`" for loop in robot.loops)
-    fault = f"the points of {loops} stay {distance:.3g} m apart"
-    if distance <= MAX_GAP["float32"]:
-        fault = f"{loops} would have to pass a singular pose"
     return InputError(
         f"the loops of `{robot.name}` do not close at sample {sample}, where "
-        f"{', '.join(robot.joint_names)} are at {positions}: {fault}; keep `q` within "
-        "the reach of the mechanism, on the branch of the description."
+        f"{', '.join(robot.joint_names)} are at {positions}: on the way there the "
+        f"points of {loops} stay together only up to {last_positions}, near a singular "
+        "pose; keep `q` within the reach of the mechanism, on the branch of the "
+        "description."
     )

@@ -180,6 +180,26 @@ def test_loops_keep_their_branch_and_name_the_sample_that_does_not_close(tmp_pat
     assert np.isnan(jax.jit(robot.close)(q)[1]).all()
 
 
+def test_no_step_jumps_over_a_singular_pose(tmp_path):
+    path = tmp_path / "mechanism.xml"
+    path.write_text(MECHANISMS["palletiser"].text)
+    robot = jid.load_mjcf(path)
+    start = np.asarray(robot.loop_pose)[:3]
+    change = np.random.default_rng(5).uniform(-2.5, 2.5, (400, 3))
+    # The bars of the parallelogram lie in a line where this angle is 0 or pi.
+    angle = (start + change)[:, 1] - (start + change)[:, 2]
+    is_before = (angle > 0.1) & (angle < np.pi - 0.1)
+    is_behind = (angle < -0.1) | (angle > np.pi + 0.1)
+    closed = np.asarray(jax.jit(robot.close)(start + change))
+    assert np.isfinite(closed[is_before]).all()
+    np.testing.assert_allclose(closed[is_before, 3], -angle[is_before], atol=1e-9)
+    assert np.isnan(closed[is_behind]).all()
+    coordinates = robot.close((start + change)[is_before])
+    np.testing.assert_allclose(coordinates, closed[is_before], atol=1e-9)
+    with pytest.raises(InputError, match="near a singular pose"):
+        robot.close((start + change)[is_behind])
+
+
 def test_loops_of_the_api_are_those_of_the_file(tmp_path):
     mechanism = MECHANISMS["palletiser"]
     path = tmp_path / "mechanism.xml"

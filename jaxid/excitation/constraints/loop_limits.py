@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, Joints
 from jaxid.program.sample_methods import evaluate_samples
-from jaxid.robot.joint_coordinates import all_rates
-from jaxid.robot.loop_closing import MIN_SAFE_SHARE, Closure
+from jaxid.robot.joint_coordinates import all_rates, loop_closure
+from jaxid.robot.loop_closing import MIN_SAFE_SHARE, closed_samples
 from jaxid.robot.robot import Robot
 
 from .clearance import SIZE
@@ -29,14 +29,13 @@ class LoopLimits(AbstractConstraint):
 
     def __call__(self, robot, motion):
         """Return the open distance, then the shares, ranges and speeds."""
+        coordinates, _ = closed_samples(robot, motion.q)
         excess = eqx.Partial(self.excess, robot)
-        return evaluate_samples(excess, excess.__call__, motion.q, motion.qd)
+        return evaluate_samples(excess, excess.__call__, coordinates, motion.qd)
 
-    def excess(self, robot: Robot, q: Joints, qd: Joints) -> AnyArray:
-        """Return the relative excess of one sample over each limit."""
-        closure = Closure(robot).of_sample(q)
-        coordinates = closure[: robot.bodies]
-        square, share = closure[robot.bodies :]
+    def excess(self, robot: Robot, coordinates: Joints, qd: Joints) -> AnyArray:
+        """Return the relative excess over each limit, of one sample of all joints."""
+        square, share = loop_closure(robot, coordinates)
         rates = all_rates(robot, coordinates, qd)
         values = [square / SIZE**2 - SIZE**2, 1.0 - share / self.min_share]
         for body, joint in _moved_joints(robot):
