@@ -4,7 +4,6 @@ import functools
 from collections.abc import Callable
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from jaxid.arrays import AnyArray, Float
@@ -30,16 +29,11 @@ def body_parameters(model: Model, p: Float[AnyArray, " standard"]) -> BodyParame
 def other_forces(fit: Fit) -> Callable[..., Any]:
     """Return the function of one sample for the forces of all other terms."""
     model = fit.base.model
-
-    def forces(q, qd, qdd, s=None):
-        model_with_state = model if s is None else model.with_memory(state=s)
-        total = jnp.zeros_like(q)
-        for term, p in model_with_state.split(fit.standard_parameters):
-            if not term.body_parameters:
-                total = total + term.forces(model.robot, p, q, qd, qdd)
-        return total
-
-    return forces
+    p = np.array(fit.standard_parameters, np.float64)
+    for term, values in model.split(p):
+        if term.body_parameters:
+            values[:] = 0.0
+    return functools.partial(model.forces, p)
 
 
 def torques(fit: Fit) -> Callable[..., Any]:
