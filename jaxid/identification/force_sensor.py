@@ -9,24 +9,20 @@ import scipy
 
 from jaxid.arrays import AnyArray, BaseVector, Float, Matrix, Matrix3, Texts
 from jaxid.dynamics.base import BaseParameters
-from jaxid.dynamics.terms import SensorRotation
-from jaxid.measurement.observations import ObservedLogs
-from jaxid.robot.inertia import INERTIAL_NAMES
+from jaxid.dynamics.model import Model
+from jaxid.dynamics.terms import SensorBias, SensorLoad, SensorRotation
+from jaxid.measurement.observations import Observations, ObservedLogs
+from jaxid.measurement.sensor_turns import SensorRows
 from jaxid.robot.robot import Robot
 from jaxid.robot.virtual_joints import GROUP
 
-from .estimators import WeightedLeastSquares
 from .parameter_changes import equality_test
-from .problem import RegressionProblem
 from .uncertainty import Uncertainty
 
-STEPS = 2
-"""Fits before the last one: the first finds the load, the second turns the sensor.
-
-A rotation of 3 degrees is then known but for the square of its error, 0.001 degrees.
-"""
-MAX_STEP = 0.5
-"""Largest rotation that is believed in one step [rad]."""
+ROWS = 300
+"""Rows of a log in which a rotation is searched, at most."""
+BLOCKS = 20
+"""Blocks of time of a log whose errors are independent."""
 
 
 class SensorEstimates(eqx.Module):
@@ -141,6 +137,40 @@ def mounting_rotation(robot: Robot) -> Matrix3:
     return np.asarray(robot.axis)[list(robot.rigid[-GROUP:])][:3].T
 
 
+def some_rows(log: Observations) -> slice:
+    """Return the rows of a log in which a rotation is searched."""
+    return slice(None, None, -(-log.rows // ROWS))
+
+
+def wrench_rows(model: Model, logs: ObservedLogs) -> SensorRows:
+    """Return wrenches of a sensor in some rows, and what bodies and biases explain.
+
+    Args:
+        model: Model of the bodies that the sensor carries, and its biases.
+        logs: Observations of one log or of several.
+    """
+    logs = (logs,) if isinstance(logs, Observations) else logs
+    places = list(model.robot.rigid[-GROUP:])
+    parts = []
+    for number, log in enumerate(logs):
+        rows = some_rows(log)
+        motion = log.reduced_motion[rows]
+        wrench = log.reduced_forces[rows][:, places]
+        known = np.asarray(model.tool_forces(motion))[:, places]
+        columns = np.asarray(model.regressor(motion))[:, places]
+        times = np.arange(len(wrench)) / len(wrench)
+        blocks = (BLOCKS * (number + times)).astype(int)
+        parts.append((wrench, known, columns, blocks))
+    wrench, known, columns, blocks = map(np.concatenate, zip(*parts, strict=True))
+    return SensorRows(
+        measured=wrench.reshape(-1, 2, 3),
+        known=known.reshape(-1, 2, 3),
+        columns=columns.reshape(-1, 2, 3, model.size),
+        prior=np.zeros(model.size),
+        blocks=blocks,
+    )
+
+
 def identify_sensor_rotation(
     base: BaseParameters, observations: ObservedLogs, *, turns: bool = True
 ) -> BaseParameters:
@@ -158,29 +188,13 @@ def identify_sensor_rotation(
         turns: Whether to turn the sensor; otherwise only the load is found, as for
             another run with a sensor that is turned already.
     """
-    if not any(isinstance(term, SensorRotation) for term in base.model.terms):
-        return base
-    robot = base.model.robot
-    number = robot.numbers[robot.rigid[-1]]
-    load_places = [base.names.index(f"{name}{number}") for name in INERTIAL_NAMES]
-    angle_places = [base.names.index(f"r{axis}{number}") for axis in "xyz"]
-    problem = RegressionProblem(base, observations)
-    for step in range(STEPS if turns else 1):
-        estimates = WeightedLeastSquares()(problem).parameters
-        # The first fit knows no load by which a rotation could be told.
-        angles = np.zeros(3) if step == 0 else estimates[angle_places]
-        if np.linalg.norm(angles) > MAX_STEP:
-            break
-        base = _turned(base, estimates[load_places], angles)
-        problem = problem.with_base(base)
-    return base
-
-
-def _turned(base: BaseParameters, load: AnyArray, angles: AnyArray) -> BaseParameters:
-    """Return the base parameters of a model with another load and turned axes."""
     model = base.model
-    rotation = scipy.spatial.transform.Rotation.from_rotvec(angles).as_matrix()
-    attitude = mounting_rotation(model.robot) @ rotation
+    if not any(isinstance(term, SensorRotation) for term in model.terms):
+        return base
+    rows = wrench_rows(Model(model.robot, (SensorLoad(), SensorBias())), observations)
+    turn = rows.estimate().turn if turns else np.eye(3)
+    load = rows.turned(turn).unknowns()[:10]
+    attitude = mounting_rotation(model.robot) @ turn
     axes = np.array(model.robot.axis)
     axes[list(model.robot.rigid[-GROUP:])] = np.tile(attitude.T, (2, 1))
     terms = [

@@ -22,6 +22,7 @@ class TurnSettings(NamedTuple):
 
     rank: float = 1e-6  # least singular value of the columns, over the largest one
     rounding: float = 1e-12  # share of the vectors that is rounding only
+    tie: float = 1.1  # ratio of the errors of turns that are equally good
     steps: int = 30  # of Gauss and Newton, from each start
     student: float = 2.2  # 95 % interval over the deviation, of some ten blocks
 
@@ -77,14 +78,31 @@ class SensorRows(NamedTuple):
         """Return the rows along other axes, the same ones or others in each row."""
         return self._replace(measured=self.measured @ np.swapaxes(turn, -1, -2))
 
-    def estimate(self, errors: Float[np.ndarray, "2"], tie: float) -> TurnEstimate:
+    def beside(self, columns: Float[np.ndarray, "rows 2 3 others"]) -> "SensorRows":
+        """Return the rows with more unknowns, which come last."""
+        zeros = np.zeros(columns.shape[3])
+        return self._replace(
+            columns=np.concatenate([self.columns, columns], axis=3),
+            prior=np.append(self.prior, zeros),
+        )
+
+    @property
+    def sizes(self) -> Float[np.ndarray, "2"]:
+        """RMS of the two vectors without their means."""
+        variances = np.var(self.measured, axis=0)
+        return np.maximum(np.sqrt(np.mean(variances, axis=1)), 1e-300)
+
+    def estimate(
+        self, errors: AnyArray | None = None, tie: float = SETTINGS.tie
+    ) -> TurnEstimate:
         """Find the smallest of the best turns.
 
         Args:
-            errors: Guess of the errors of the two vectors.
+            errors: Guess of the errors of the two vectors; in proportion to their sizes
+                if None.
             tie: Largest ratio of the errors of turns that are equally good.
         """
-        vectors = self._vectors(errors)
+        vectors = self._vectors(self.sizes if errors is None else errors)
         turn = vectors.least_turn(tie)
         # The final estimate uses the errors that are found.
         errors = self._errors(turn, vectors.unknowns(turn))
@@ -93,6 +111,10 @@ class SensorRows(NamedTuple):
         unknowns = vectors.unknowns(turn)
         covariance = self._covariance(turn, unknowns, errors)
         return TurnEstimate(turn, unknowns, self._errors(turn, unknowns), covariance)
+
+    def unknowns(self) -> Vector:
+        """Return the best unknowns of vectors that are not turned."""
+        return self._vectors(self.sizes).unknowns(np.eye(3))
 
     def _vectors(self, errors: Float[np.ndarray, "2"]) -> "_TurnedVectors":
         """Eliminate the unknowns."""

@@ -60,7 +60,8 @@ class RunsReport(Summarised):
     @property
     def verdict(self) -> Remark:
         """Whether the result can be used, in one sentence."""
-        remarks = [*self.result.summary().remarks, *self.findings]
+        # What is wrong with the logs explains what is wrong with the result.
+        remarks = [*self.findings, *self.result.summary().remarks]
         faults = [remark for remark in remarks if remark.status is Status.BAD]
         if faults:
             return faults[0]

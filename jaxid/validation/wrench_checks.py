@@ -13,15 +13,14 @@ import scipy
 
 from jaxid.arrays import Matrix3, Vector, Vector3
 from jaxid.dynamics.model import Model
-from jaxid.dynamics.motion import Motion
 from jaxid.dynamics.terms import SensorBias, SensorLoad
+from jaxid.identification.force_sensor import some_rows, wrench_rows
 from jaxid.measurement.force_sensors import sensor_attitudes
 from jaxid.measurement.observations import Observations
 from jaxid.measurement.sensor_turns import SensorRows, TurnEstimate, half_widths
-from jaxid.result_table import Remark, Status, significant
+from jaxid.result_table import Remark, Status, percent, significant
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import skew
-from jaxid.robot.virtual_joints import GROUP
 
 
 class WrenchLimits(NamedTuple):
@@ -30,15 +29,13 @@ class WrenchLimits(NamedTuple):
     Set on simulated logs of a Panda, shown on a UR5, a UR10, a Kinova and an xArm.
     """
 
-    rows: int = 300  # rows of the log that are looked at
-    blocks: int = 20  # blocks of time whose errors are independent
-    tie: float = 1.1  # ratio of what turns leave unexplained that are equally good
     right: float = 0.5  # remaining part of the unexplained if another reading is right
     slip: float = 2.0  # slow errors of the sensor, over half of the 95 % interval
     base_angle: float = np.deg2rad(1.5)  # rotation that is not named under the base
     wrist_angle: float = np.deg2rad(10.0)  # smaller ones are estimated with the load
     distance: float = 0.01  # displacement that is not named [m]
     spoilt: float = np.deg2rad(10.0)  # rotation that spoils any result
+    absent: float = 0.25  # share of gravity that lacks
     tared: float = 0.1  # force at the start over gravity of the load
     min_mass: float = 0.02  # of a load [kg]
     max_lever: float = 1.0  # from the sensor to a load, or from its description [m]
@@ -49,10 +46,6 @@ LIMITS = WrenchLimits()
 EXCHANGED = (
     "forces and moments are exchanged: the bodies behind the sensor explain the last "
     "three columns of `wrench` as forces. Name the three forces first."
-)
-WITHOUT_GRAVITY = (
-    "the wrench lacks the gravity of the load, which the controller or the driver "
-    "takes out: set the load to zero there, and record again."
 )
 IN_GROUND = (
     "the wrench is along the axes of the ground, not of the sensor: gravity is the "
@@ -85,70 +78,46 @@ def wrench_remarks(model: Model, observations: Observations) -> list[Remark]:
     robot = model.robot
     if not robot.has_base_sensor:
         model = Model(robot, (SensorLoad(), SensorBias()))
-    rows = slice(None, None, -(-observations.rows // LIMITS.rows))
-    motion = observations.reduced_motion[rows]
-    wrench = _wrench_rows(model, motion, observations.reduced_forces[rows])
-    estimate = wrench.estimate(_sizes(wrench), LIMITS.tie)
+    wrench = wrench_rows(model, observations)
+    estimate = wrench.estimate()
     max_share = LIMITS.right * _unexplained_share(wrench, estimate)
-    for text, reading in _other_readings(model, motion, wrench).items():
-        other_estimate = reading.estimate(_sizes(reading), LIMITS.tie)
-        if _unexplained_share(reading, other_estimate) < max_share:
+    for text, reading in _other_readings(robot, observations, wrench).items():
+        if _unexplained_share(reading, reading.estimate()) < max_share:
             return [Remark(text, Status.BAD)]
-    remarks = []
-    if _mean_inertia(model, estimate.unknowns, motion) < 0.0:
-        is_turned = np.linalg.norm(estimate.angles) > LIMITS.spoilt
-        remarks.append(Remark(MIRRORED if is_turned else OPPOSITE_SIGN, Status.BAD))
     if robot.has_base_sensor:
-        return [*remarks, *_base_remarks(robot, wrench, estimate)]
-    attitude = np.asarray(robot.tip_rotation).T
-    remarks += _turn_remarks(attitude, estimate, LIMITS.wrist_angle)
-    return [*remarks, *_load_remarks(wrench, estimate.unknowns)]
-
-
-def _wrench_rows(model: Model, motion: Motion, forces: np.ndarray) -> SensorRows:
-    """Return the wrench of a sensor, and what bodies and biases explain of it."""
-    places = list(model.robot.rigid[-GROUP:])
-    shape = (-1, 2, 3)
-    columns = np.asarray(model.regressor(motion))[:, places]
-    return SensorRows(
-        measured=forces[:, places].reshape(shape),
-        known=np.asarray(model.tool_forces(motion))[:, places].reshape(shape),
-        columns=columns.reshape(*shape, model.size),
-        prior=np.zeros(model.size),
-        blocks=np.arange(len(forces)) * LIMITS.blocks // len(forces),
-    )
-
-
-def _sizes(wrench: SensorRows) -> np.ndarray:
-    """Return the RMS of forces and of moments without their means."""
-    variances = np.var(wrench.measured, axis=0)
-    return np.maximum(np.sqrt(np.mean(variances, axis=1)), 1e-300)
+        remarks = _base_remarks(robot, wrench, estimate)
+    else:
+        remarks = _wrist_remarks(model, observations, wrench, estimate)
+    if _mean_inertia(model, estimate.unknowns, observations) < 0.0:
+        is_turned = np.linalg.norm(estimate.angles) > LIMITS.spoilt
+        text = MIRRORED if is_turned else OPPOSITE_SIGN
+        remarks.insert(0, Remark(text, Status.BAD))
+    units = [remark for remark in remarks if remark.text == UNITS]
+    return units or remarks
 
 
 def _unexplained_share(wrench: SensorRows, estimate: TurnEstimate) -> float:
     """Return what bodies do not explain, over forces and moments."""
-    return float(np.linalg.norm(estimate.errors / _sizes(wrench)))
+    return float(np.linalg.norm(estimate.errors / wrench.sizes))
 
 
 def _other_readings(
-    model: Model, motion: Motion, wrench: SensorRows
+    robot: Robot, observations: Observations, wrench: SensorRows
 ) -> dict[str, SensorRows]:
     """Return the other ways to read a wrench, each with the text that names it."""
     readings = {EXCHANGED: wrench._replace(measured=wrench.measured[:, ::-1])}
-    robot = model.robot
-    if robot.has_base_sensor:
-        return readings
-    attitudes = sensor_attitudes(robot, np.asarray(motion.q))
-    readings[IN_GROUND] = wrench.turned(np.swapaxes(attitudes, 1, 2))
-    weightless = Model(robot.replace(gravity=np.zeros(3)), model.terms)
-    columns = np.asarray(weightless.regressor(motion))[:, list(robot.rigid[-GROUP:])]
-    columns = columns.reshape(wrench.columns.shape)
-    readings[WITHOUT_GRAVITY] = wrench._replace(columns=columns)
+    if not robot.has_base_sensor:
+        motion = observations.reduced_motion[some_rows(observations)]
+        attitudes = sensor_attitudes(robot, np.asarray(motion.q))
+        readings[IN_GROUND] = wrench.turned(np.swapaxes(attitudes, 1, 2))
     return readings
 
 
-def _mean_inertia(model: Model, parameters: Vector, motion: Motion) -> float:
+def _mean_inertia(
+    model: Model, parameters: Vector, observations: Observations
+) -> float:
     """Return the mean inertia of the joints: negative for the opposite wrench."""
+    motion = observations.reduced_motion[some_rows(observations)]
     M = np.asarray(model.mass_matrix(parameters, motion.q))
     driven = list(model.robot.driven)
     return float(M[:, driven, driven].mean())
@@ -164,11 +133,8 @@ def _base_remarks(
     turned = wrench.turned(estimate.turn)
     columns = np.zeros((*turned.measured.shape, 3))
     columns[:, 1] = np.stack([skew(force) for force in turned.measured[:, 0]])
-    displaced = turned._replace(
-        columns=np.concatenate([turned.columns, columns], axis=3),
-        prior=np.append(turned.prior, np.zeros(3)),
-    )
-    last_estimate = displaced.estimate(estimate.errors, LIMITS.tie)
+    displaced = turned.beside(columns)
+    last_estimate = displaced.estimate(estimate.errors)
     turn = last_estimate.turn @ estimate.turn
     attitude = np.asarray(robot.rotation)[0]
     remarks = _turn_remarks(
@@ -216,22 +182,31 @@ def _turn_remarks(
     return [Remark(text, Status.BAD if angle > LIMITS.spoilt else Status.DOUBTFUL)]
 
 
-def _load_remarks(wrench: SensorRows, parameters: Vector) -> list[Remark]:
-    """Return that the load has no usual size, and that the wrench is tared."""
-    mass = abs(parameters[0])
-    lever = np.linalg.norm(parameters[1:4]) / mass
-    weight = 9.81 * mass
-    bias = np.linalg.norm(parameters[10:13])
-    start = np.linalg.norm(wrench.measured[0, 0])
-    remarks = []
+def _wrist_remarks(
+    model: Model,
+    observations: Observations,
+    wrench: SensorRows,
+    estimate: TurnEstimate,
+) -> list[Remark]:
+    """Return what is wrong with units, gravity, rotation and taring at the wrist."""
+    if _lever(wrench) > LIMITS.max_lever:
+        return [Remark(UNITS, Status.BAD)]
+    gravity_text = _missing_gravity(model, observations, wrench)
+    if gravity_text:
+        return [Remark(gravity_text, Status.BAD)]
+    attitude = np.asarray(model.robot.tip_rotation).T
+    remarks = _turn_remarks(attitude, estimate, LIMITS.wrist_angle)
+    mass = abs(estimate.unknowns[0])
     if mass < LIMITS.min_mass:
         text = (
-            f"gravity says that the load has only {significant(1e3 * mass, 2)} g: are "
-            "the forces in another unit, such as kN? Write N and N m into the log."
+            f"gravity says that the load has only {significant(1e3 * mass, 2)} g: is "
+            "there none, or are the forces in another unit, such as kN? Write N and "
+            "N m into the log."
         )
         remarks.append(Remark(text, Status.BAD))
-    elif lever > LIMITS.max_lever:
-        remarks.append(Remark(UNITS, Status.BAD))
+    weight = 9.81 * mass
+    start = np.linalg.norm(wrench.measured[0, 0])
+    bias = np.linalg.norm(estimate.unknowns[10:13])
     if start < LIMITS.tared * weight and bias > weight / 2:
         text = (
             "the force is zero at the start of the log: the driver was tared there "
@@ -240,3 +215,34 @@ def _load_remarks(wrench: SensorRows, parameters: Vector) -> list[Remark]:
         )
         remarks.append(Remark(text))
     return remarks
+
+
+def _lever(wrench: SensorRows) -> float:
+    """Return how far from the sensor its force acts, but for biases [m]."""
+    centred = wrench.measured - wrench.measured.mean(axis=0)
+    forces = np.concatenate([skew(force) for force in centred[:, 0]])
+    arm, *_ = np.linalg.lstsq(-forces, centred[:, 1].ravel(), rcond=None)
+    return float(np.linalg.norm(arm))
+
+
+def _missing_gravity(
+    model: Model, observations: Observations, wrench: SensorRows
+) -> str:
+    """Return that gravity in the wrench is not that of the load; else nothing."""
+    weightless = Model(model.robot.replace(gravity=np.zeros(3)), model.terms)
+    inertial = wrench_rows(weightless, observations)
+    # Mass and first moments.
+    gravity = (wrench.columns - inertial.columns)[..., :4]
+    estimate = inertial.beside(gravity).estimate()
+    widths = half_widths(estimate.covariance)[3:]
+    mass = estimate.unknowns[0]
+    difference = mass - estimate.unknowns[model.size]
+    width = LIMITS.slip * (widths[0] + widths[model.size])
+    if abs(difference) - width < LIMITS.absent * abs(mass):
+        return ""
+    share = percent(abs(difference / mass))
+    return (
+        f"{share} % of the gravity of the load is missing in the wrench: the "
+        "controller or the driver takes it out. Set the load to zero there, and record "
+        "again."
+    )

@@ -146,7 +146,7 @@ def test_a_wrench_that_is_not_the_one_described_is_named_by_gravity(time):
     moment = np.cross(LOAD.centre_of_mass, weight)
     inertial = wrench(time, turn=0 * TURN) - np.hstack([weight, moment])
     (compensated,) = findings(time, noisy(inertial, 4))
-    assert "lacks the gravity" in compensated.text
+    assert "gravity of the load is missing" in compensated.text
     tared = right - right[40]
     noise = np.random.default_rng(5).normal(size=tared.shape) * 0.02
     (zeroed,) = findings(time, tared + noise)
