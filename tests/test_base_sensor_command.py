@@ -165,9 +165,9 @@ def test_torques_tell_friction_beside_the_wrench(here, run):  # noqa: F811
 
 def test_speeds_in_a_list_are_those_of_the_driven_joints(cell):
     """A sensor at the end-effector adds virtual joints behind, not before them."""
-    setup = jid.experiment.load_experiment(cell / "f.toml").setup
+    experiment = jid.experiment.load_experiment(cell / "f.toml")
     sensor = jid.workflow.ForceSensor(["fx", "fy", "fz", "tx", "ty", "tz"])
-    model = sensor.base(setup, has_forces=True).model
+    model = sensor.beside(experiment.setup, experiment.columns).model
     qd = np.zeros(9)
     qd[:3] = 0.01, 0.02, -0.03
     regressor = np.asarray(model.regressor(jid.Motion(0.3 * qd, qd, 0 * qd)))

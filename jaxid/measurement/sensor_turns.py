@@ -93,7 +93,7 @@ class SensorRows(NamedTuple):
         return np.maximum(np.sqrt(np.mean(variances, axis=1)), 1e-300)
 
     def estimate(
-        self, errors: AnyArray | None = None, tie: float = SETTINGS.tie
+        self, errors: Float[np.ndarray, "2"] | None = None, tie: float = SETTINGS.tie
     ) -> TurnEstimate:
         """Find the smallest of the best turns.
 

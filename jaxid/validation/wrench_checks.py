@@ -38,6 +38,7 @@ class WrenchLimits(NamedTuple):
     absent: float = 0.25  # share of gravity that lacks
     tared: float = 0.1  # force at the start over gravity of the load
     min_mass: float = 0.02  # of a load [kg]
+    lever: float = 0.1  # usual one [m]
     max_lever: float = 1.0  # from the sensor to a load, or from its description [m]
 
 
@@ -81,9 +82,14 @@ def wrench_remarks(model: Model, observations: Observations) -> list[Remark]:
     wrench = wrench_rows(model, observations)
     estimate = wrench.estimate()
     max_share = LIMITS.right * _unexplained_share(wrench, estimate)
-    for text, reading in _other_readings(robot, observations, wrench).items():
-        if _unexplained_share(reading, reading.estimate()) < max_share:
-            return [Remark(text, Status.BAD)]
+    readings = _other_readings(robot, observations, wrench)
+    shares = {
+        text: _unexplained_share(reading, reading.estimate())
+        for text, reading in readings.items()
+    }
+    text = min(shares, key=shares.__getitem__)
+    if shares[text] < max_share:
+        return [Remark(text, Status.BAD)]
     if robot.has_base_sensor:
         remarks = _base_remarks(robot, wrench, estimate)
     else:
@@ -110,6 +116,10 @@ def _other_readings(
         motion = observations.reduced_motion[some_rows(observations)]
         attitudes = sensor_attitudes(robot, np.asarray(motion.q))
         readings[IN_GROUND] = wrench.turned(np.swapaxes(attitudes, 1, 2))
+        lever = _lever(wrench)
+        if lever > LIMITS.max_lever:
+            usual_size = np.array([[1.0], [LIMITS.lever / lever]])
+            readings[UNITS] = wrench._replace(measured=usual_size * wrench.measured)
     return readings
 
 
@@ -189,8 +199,6 @@ def _wrist_remarks(
     estimate: TurnEstimate,
 ) -> list[Remark]:
     """Return what is wrong with units, gravity, rotation and taring at the wrist."""
-    if _lever(wrench) > LIMITS.max_lever:
-        return [Remark(UNITS, Status.BAD)]
     gravity_text = _missing_gravity(model, observations, wrench)
     if gravity_text:
         return [Remark(gravity_text, Status.BAD)]
@@ -218,7 +226,7 @@ def _wrist_remarks(
 
 
 def _lever(wrench: SensorRows) -> float:
-    """Return how far from the sensor its force acts, but for biases [m]."""
+    """Return how far from the sensor its force acts [m]."""
     centred = wrench.measured - wrench.measured.mean(axis=0)
     forces = np.concatenate([skew(force) for force in centred[:, 0]])
     arm, *_ = np.linalg.lstsq(-forces, centred[:, 1].ravel(), rcond=None)

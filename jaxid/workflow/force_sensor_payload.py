@@ -2,13 +2,11 @@
 
 import dataclasses
 from collections.abc import Sequence
-from functools import partial
-from pathlib import Path
 
 import jax
 import numpy as np
 
-from jaxid.dynamics.base import BaseParameters, base_parameters
+from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import (
     AbstractTerm,
@@ -18,23 +16,16 @@ from jaxid.dynamics.terms import (
 )
 from jaxid.errors import InputError
 from jaxid.identification.fit_result import Fit
-from jaxid.identification.force_sensor import identify_sensor_rotation
-from jaxid.identification.friction_laws import identify_transition_speeds
 from jaxid.identification.identify import identify
 from jaxid.identification.payload import Payload, identify_payload
 from jaxid.measurement.columns import Columns
-from jaxid.measurement.force_sensors import along_sensor_axes
 from jaxid.measurement.log_columns import Selection
-from jaxid.measurement.observations import Observations, observe
-from jaxid.result_table import Remark, Status
+from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
 from jaxid.robot.virtual_joints import GROUP
-from jaxid.validation.diagnosis import diagnose
-from jaxid.validation.wrench_checks import wrench_remarks
 
-from .log_loading import read_log
-from .setup import Progress, Setup
+from .setup import Setup
 
 PART_TIME = 60.0
 """Shortest part of a log that may have a bias of its own [s]."""
@@ -102,63 +93,33 @@ class ForceSensor:
         return dataclasses.replace(columns, wrench=self.wrench, wrench_sign=self.sign)
 
     def beside(self, setup: Setup, columns: Columns) -> Setup:
-        """Return the setup of a robot on the sensor, for `jaxid identify`.
+        """Return the setup of a robot with the sensor.
 
-        Logs without forces of the joints tell nothing of friction and rotors.
+        Logs without forces of the joints tell of what the sensor carries only, and
+        nothing of friction and rotors.
 
         Raises:
             InputError: If friction grows with the load.
         """
         if setup.load_friction:
             raise InputError(
-                "`load` in `[model]` must not be given with a sensor under the base: "
-                "leave it out."
+                "`load` in `[model]` must not be given with a force sensor: leave it "
+                "out."
             )
+        robot = self.on(setup.robot)
         terms = self.terms_on(setup)
         if columns.forces is None:
             terms = tuple(term for term in terms if term.body_parameters)
-        model = Model(self.on(setup.robot), (*terms, SensorBias()))
-        return dataclasses.replace(setup, unknowns=model)
-
-    def base(self, setup: Setup, has_forces: bool) -> BaseParameters:
-        """Return the base parameters of the robot with the sensor.
-
-        Logs without forces of the joints tell of what is behind the sensor only.
-        """
-        robot = self.on(setup.robot)
-        bodies = self.terms_on(setup) if has_forces else (SensorLoad(),)
-        return base_parameters(Model(robot, (*bodies, SensorBias(), SensorRotation())))
-
-
-def sensor_logs(
-    setup: Setup,
-    base: BaseParameters,
-    paths: Sequence[Path],
-    columns: Columns,
-    sensor: ForceSensor,
-    progress: Progress,
-) -> tuple[list[Observations], list[Remark]]:
-    """Return logs with a wrench, and what is wrong with them."""
-    robot = base.model.robot
-    logs = []
-    remarks = []
-    for path in paths:
-        progress(f"reading {path.name}", 0.0)
-        recording = read_log(setup, path, columns)
-        if sensor.in_ground:
-            recording = along_sensor_axes(recording, robot)
-        log = observe(recording, robot, setup.filter, setup.decimation, setup.min_speed)
-        logs.append(log)
-        remarks += [
-            dataclasses.replace(x, text=f"{recording.name}: {x.text}")
-            for x in wrench_remarks(base.model, log)
-        ]
-        if recording.forces is not None:
-            of_joints = dataclasses.replace(recording, wrench=None)
-            diagnosis = diagnose(of_joints, setup.robot, min_speed=setup.min_speed)
-            texts = [f"{recording.name}: {text}" for text in diagnosis.findings]
-            remarks += [Remark(text, Status.DOUBTFUL) for text in texts]
-    return logs, remarks
+        if self.under_base:
+            model = Model(robot, (*terms, SensorBias()))
+            return dataclasses.replace(setup, unknowns=model)
+        if columns.forces is None:
+            terms = (SensorLoad(),)
+        model = Model(robot, (*terms, SensorBias(), SensorRotation()))
+        reading = dataclasses.replace(setup.reading, in_ground=self.in_ground)
+        return dataclasses.replace(
+            setup, unknowns=model, reading=reading, filter_candidates=()
+        )
 
 
 def parts_of(log: Observations) -> list[Observations]:
@@ -175,31 +136,25 @@ def parts_of(log: Observations) -> list[Observations]:
     return parts
 
 
-def payload_of_logs(
+def with_drifting_bias(
+    payload: Payload,
+    unloaded: Fit | None,
     base: BaseParameters,
-    unloaded: Sequence[Observations],
     loaded: Sequence[Observations],
     mass: float | None,
-    progress: Progress,
-) -> tuple[Payload, Fit]:
-    """Return the payload behind the sensor, and the last fit with it.
+) -> Payload:
+    """Return the payload of parts with biases of their own, if these are not equal.
 
-    Each part of long logs has a bias of its own if they differ by more than chance.
+    Args:
+        payload: Payload of logs that have one bias.
+        unloaded: Fit without the payload, if there is one.
+        base: Base parameters of the runs with the payload.
+        loaded: Logs with the payload.
+        mass: Mass of the payload, if it is known [kg].
     """
-    progress("turning the sensor", 0.0)
-    base = identify_transition_speeds(base, loaded)
-    base = identify_sensor_rotation(base, loaded)
-    stage = partial(progress, "identifying the payload")
-    empty_fit = None
-    if unloaded:
-        empty_base = identify_sensor_rotation(base, unloaded, turns=False)
-        empty_fit = identify(empty_base, unloaded, progress=stage, name="unloaded")
-    fit = identify(base, loaded, progress=stage, name="loaded")
-    payload = identify_payload(empty_fit, fit, mass=mass)
     parts = [part for log in loaded for part in parts_of(log)]
-    if len(parts) > 1:
-        fits = [identify(base, part) for part in parts]
-        by_parts = identify_payload(empty_fit, fits, mass=mass)
-        if by_parts.has_drifting_bias:
-            return by_parts, fits[-1]
-    return payload, fit
+    if len(parts) == 1:
+        return payload
+    fits = [identify(base, part) for part in parts]
+    by_parts = identify_payload(unloaded, fits, mass=mass)
+    return by_parts if by_parts.has_drifting_bias else payload

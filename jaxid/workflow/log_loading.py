@@ -14,6 +14,7 @@ from jaxid.errors import InputError
 from jaxid.identification.filter_selection import choose_filter
 from jaxid.io import FilePath
 from jaxid.measurement.columns import Columns
+from jaxid.measurement.force_sensors import along_sensor_axes
 from jaxid.measurement.imu_offset import without_imu_offset
 from jaxid.measurement.log_files import estimated_rows
 from jaxid.measurement.observations import Observations
@@ -74,6 +75,8 @@ def read_log(setup: Setup, log: FilePath, columns: Columns) -> Recording:
         recording = remove_delay(recording, reading.force_delay)
     if reading.imu_offset:
         recording = without_imu_offset(recording, setup.robot, setup.filter)
+    if reading.in_ground:
+        recording = along_sensor_axes(recording, setup.robot)
     return recording
 
 

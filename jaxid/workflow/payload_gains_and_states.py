@@ -13,6 +13,7 @@ from jaxid.errors import InputError
 from jaxid.identification.drive_gains import DriveGains, identify_drive_gains
 from jaxid.identification.estimators import Complete
 from jaxid.identification.fit_result import Fit
+from jaxid.identification.force_sensor import identify_sensor_rotation
 from jaxid.identification.friction_laws import identify_transition_speeds
 from jaxid.identification.identify import fit_problem
 from jaxid.identification.operating_states import identify_states
@@ -37,8 +38,9 @@ from jaxid.result_table import Remark, Status
 from jaxid.robot.inertia import INERTIAL_NAMES, INERTIAL_UNITS, Tool
 from jaxid.validation.diagnosis import mistakes_in_logs
 from jaxid.validation.torque_errors import errors_of_parameters
+from jaxid.validation.wrench_checks import wrench_remarks
 
-from .force_sensor_payload import ForceSensor, payload_of_logs, sensor_logs
+from .force_sensor_payload import ForceSensor, with_drifting_bias
 from .log_loading import load_logs, select_filter
 from .setup import Paths, Progress, Setup, ignore_progress
 
@@ -49,13 +51,13 @@ MIN_CHANCE_OF_SHARING = 0.01
 
 
 class Runs(NamedTuple):
-    """Fits of several runs, and doubts about their logs."""
+    """Fits of several runs by their names, and doubts about their logs."""
 
-    fits: list[Fit]
-    logs: list[list[Observations]]  # logs of each run
-    doubts: list[str]
+    fits: dict[str, Fit]
+    logs: dict[str, list[Observations]]  # logs of each run
+    remarks: list[Remark]
     sources: Mapping[str, Sequence[Path]]  # paths of the logs of each run
-    gain_doubts: list[str]  # doubts about the gains of the forces
+    gain_doubts: list[Remark]  # doubts about the gains of the forces
 
 
 def fit_runs(
@@ -72,20 +74,21 @@ def fit_runs(
         columns: Meaning of the columns of the logs.
         progress: Callback, called with a stage and its completed fraction (0 to 1).
     """
-    doubts = []
+    remarks = []
     if not has_plain_estimator(setup):
-        doubts.append(
+        text = (
             "this command always uses weighted least squares: the rest of "
             "`[estimator]` is ignored"
         )
+        remarks.append(Remark(text, Status.DOUBTFUL))
     progress("finding base parameters", 0.0)
     paths = [path for group in groups.values() for path in group]
     setup = select_filter(setup, paths, columns, progress)
-    runs = Runs([], [], doubts, groups, [])
+    runs = Runs({}, {}, remarks, groups, [])
     for name in groups:
         fit = add_run(runs, setup, name, columns, progress)
         # The columns of all runs must be the same.
-        setup = setup.with_transition_speeds_of(fit)
+        setup = dataclasses.replace(setup, unknowns=fit.base)
     return runs
 
 
@@ -104,14 +107,16 @@ def add_run(
     observations = [log.observations for log in logs]
     row_progress = partial(progress, f"factorising the rows, {name}")
     base = identify_transition_speeds(setup.base, observations)
+    # The first run tells how a force sensor is turned.
+    base = identify_sensor_rotation(base, observations, turns=not runs.fits)
     rows = RegressionProblem(base, observations, row_progress)
     fit = dataclasses.replace(fit_problem(rows, setup.least_squares), name=name)
     mistakes = mistakes_in_logs([log.diagnosis for log in logs], fit)
-    runs.doubts.extend(text for log in logs for text in log.findings)
-    doubts = runs.gain_doubts if mistakes.are_gains else runs.doubts
-    doubts.extend(mistakes.certain)
-    runs.fits.append(fit)
-    runs.logs.append(observations)
+    runs.remarks.extend(_as_doubts([text for log in logs for text in log.findings]))
+    doubts = runs.gain_doubts if mistakes.are_gains else runs.remarks
+    doubts.extend(_as_doubts(mistakes.certain))
+    runs.fits[name] = fit
+    runs.logs[name] = observations
     return fit
 
 
@@ -158,56 +163,41 @@ def identify_payload_from_logs(
         sensor: Force sensor in front of the payload, if there is one: then logs without
             the payload may be missing, and forces of the joints.
     """
+    groups = separate_groups(unloaded, loaded)
     if sensor is not None:
         if body is not None:
             raise InputError(
                 "`body` (`--body`) must not be given with `[sensor]`: the payload is "
                 "behind the sensor, on the end-effector."
             )
-        return identify_payload_by_sensor(
-            setup, unloaded, loaded, columns, sensor, mass, progress
-        )
-    if not unloaded:
+        setup = sensor.beside(setup, columns)
+        columns = sensor.columns(columns)
+        # The load tells how the sensor is turned.
+        groups = {name: groups[name] for name in ("loaded", "unloaded") if groups[name]}
+    elif not unloaded:
         raise InputError(
             "give a log without the payload, too; or describe a force sensor in "
             "`[sensor]`, behind which everything is payload."
         )
-    groups = separate_groups(unloaded, loaded)
     runs = fit_runs(setup, groups, columns, progress)
-    payload = identify_payload(*runs.fits, body=body, mass=mass)
-    loaded_fit = runs.fits[1]
-    doubts = _as_doubts([*runs.doubts, *runs.gain_doubts])
-    return payload_report(
-        payload, loaded_fit, runs.logs[1], runs.sources, doubts, progress
-    )
+    unloaded_fit = runs.fits.get("unloaded")
+    loaded_fit = runs.fits["loaded"]
+    logs = runs.logs["loaded"]
+    payload = identify_payload(unloaded_fit, loaded_fit, body=body, mass=mass)
+    remarks = [*runs.remarks, *runs.gain_doubts]
+    if sensor is not None:
+        payload = with_drifting_bias(payload, unloaded_fit, loaded_fit.base, logs, mass)
+        remarks += _wrench_remarks(setup, logs)
+    return payload_report(payload, loaded_fit, logs, runs.sources, remarks, progress)
 
 
-def identify_payload_by_sensor(
-    setup: Setup,
-    unloaded: Paths,
-    loaded: Paths,
-    columns: Columns,
-    sensor: ForceSensor,
-    mass: float | None,
-    progress: Progress,
-) -> RunsReport:
-    """Identify a payload behind a force sensor, see `identify_payload_from_logs`."""
-    groups = separate_groups(unloaded, loaded)
-    columns = sensor.columns(columns)
-    progress("finding base parameters", 0.0)
-    base = sensor.base(setup, columns.forces is not None)
-    logs = {}
-    remarks = []
-    for name, paths in groups.items():
-        logs[name], findings = sensor_logs(
-            setup, base, paths, columns, sensor, progress
-        )
-        # Without a load there is nothing that gravity could tell.
-        remarks += findings if name == "loaded" else []
-    payload, fit = payload_of_logs(
-        base, logs["unloaded"], logs["loaded"], mass, progress
-    )
-    return payload_report(payload, fit, logs["loaded"], groups, remarks, progress)
+def _wrench_remarks(setup: Setup, logs: Sequence[Observations]) -> list[Remark]:
+    """Return what is wrong with the wrenches of a load, each behind its log's name."""
+    return [
+        dataclasses.replace(remark, text=f"{log.name}: {remark.text}")
+        for log in logs
+        for remark in wrench_remarks(setup.model, log)
+    ]
 
 
 def payload_report(
@@ -272,7 +262,8 @@ def identify_gains_from_logs(
     """
     groups = separate_groups(unloaded, loaded)
     runs = fit_runs(setup, groups, columns, progress)
-    unloaded_fit, loaded_fit = runs.fits
+    unloaded_fit = runs.fits["unloaded"]
+    loaded_fit = runs.fits["loaded"]
     drives = identify_drive_gains(unloaded_fit, loaded_fit, load)
     names = drives.joint_names
     units = ("1",) * len(names)
@@ -288,7 +279,7 @@ def identify_gains_from_logs(
         estimates,
         content,
         runs.sources,
-        _as_doubts(runs.doubts),
+        runs.remarks,
     )
 
 
@@ -326,22 +317,23 @@ def identify_states_from_logs(
             "give one log for each of two or more states, with different names."
         )
     runs = fit_runs(setup, groups, columns, progress)
-    states = identify_states(runs.fits)
-    doubts = [*runs.doubts, *runs.gain_doubts]
+    states = identify_states(list(runs.fits.values()))
+    remarks = [*runs.remarks, *runs.gain_doubts]
     _, chance = states.sharing
     if chance < MIN_CHANCE_OF_SHARING:
-        doubts.append(
+        text = (
             "the states differ in more than friction and offsets (the probability of "
             f"such differences by chance is {100 * chance:.2g} %)"
         )
+        remarks.append(Remark(text, Status.DOUBTFUL))
     first_state, *other_states = groups
     comparisons = [states.compare(first_state, state) for state in other_states]
     kind_tables = [comparison.group_summary() for comparison in comparisons]
     parameter_tables = [comparison.summary() for comparison in comparisons]
     progress("predicting torques", 0.0)
     errors = {
-        state: errors_of_parameters(fit, states.fit(state).parameters, logs)
-        for state, fit, logs in zip(groups, runs.fits, runs.logs, strict=True)
+        state: errors_of_parameters(fit, states.fit(state).parameters, runs.logs[state])
+        for state, fit in runs.fits.items()
     }
     content = {
         "states": states.states,
@@ -358,7 +350,7 @@ def identify_states_from_logs(
         ),
         content,
         {"states": paths},
-        _as_doubts(doubts),
+        remarks,
         details=[*kind_tables, *parameter_tables],
         glance=kind_tables,
     )

@@ -109,6 +109,7 @@ class LogReading:
         stop: End of that part [s], like `10.0`.
         imu_offset: Whether rotation, place and biases of the IMU of a floating base are
             estimated, by the legs while all feet stand on level ground.
+        in_ground: Whether the wrench of a force sensor is along the axes of the ground.
     """
 
     forces_file: str | None = None
@@ -119,6 +120,7 @@ class LogReading:
     start: float = -np.inf
     stop: float = np.inf
     imu_offset: bool = False
+    in_ground: bool = False
 
     def forces_path(self, log: Path) -> Path | None:
         """Return the path of the file with the forces of a log, if it has one."""
@@ -221,18 +223,6 @@ class Setup(eqx.Module):
     def unbounded_estimator(self) -> AbstractEstimator:
         """The estimator; for bodies that can exist, least squares without bounds."""
         return self.least_squares if self.has_bounded_bodies else self.estimator
-
-    def with_transition_speeds_of(self, fit: Fit) -> "Setup":
-        """Return the setup with the speeds of the transitions that a fit has found.
-
-        Fits can be combined only if their columns are the same.
-        """
-        speed = getattr(dry_transition(fit.base.model.terms), "speed", None)
-        if speed is None:
-            return self
-        model = self.model.with_transition_speeds(speed)
-        base = eqx.tree_at(lambda b: b.model, self.base, model)
-        return dataclasses.replace(self, unknowns=base)
 
     def observe(self, recording: Recording) -> Observations:
         """Filter a recording and make rows of it."""
