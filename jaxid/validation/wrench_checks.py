@@ -38,6 +38,8 @@ class WrenchLimits(NamedTuple):
     absent: float = 0.25  # share of gravity that lacks
     tared: float = 0.1  # force at the start over gravity of the load
     min_mass: float = 0.02  # of a load [kg]
+    stiffness: float = 0.01  # of a cable that is not named [N m/rad]
+    shift: float = 5e-4  # of the centre of the load, that is not named [m]
     lever: float = 0.1  # usual one [m]
     max_lever: float = 1.0  # from the sensor to a load, or from its description [m]
 
@@ -222,7 +224,39 @@ def _wrist_remarks(
             "affected."
         )
         remarks.append(Remark(text))
-    return remarks
+    return [*remarks, *_cable_remarks(model.robot, observations, wrench, estimate)]
+
+
+def _cable_remarks(
+    robot: Robot,
+    observations: Observations,
+    wrench: SensorRows,
+    estimate: TurnEstimate,
+) -> list[Remark]:
+    """Return that moments follow the last joint, as those of a cable at the load."""
+    motion = observations.reduced_motion[some_rows(observations)]
+    joint = robot.driven[-1]
+    angle = np.asarray(motion.q)[:, joint]
+    columns = np.zeros((*wrench.measured.shape, 3))
+    columns[:, 1] = np.multiply.outer(angle - angle.mean(), np.eye(3))
+    with_cable = wrench.turned(estimate.turn).beside(columns).estimate()
+    stiffness = with_cable.unknowns[-3:]
+    widths = half_widths(with_cable.covariance)[-3:]
+    centres = [x.unknowns[1:4] / x.unknowns[0] for x in (estimate, with_cable)]
+    shift = float(np.linalg.norm(centres[1] - centres[0]))
+    is_certain = _certain_size(stiffness, widths) > LIMITS.stiffness
+    if not is_certain or shift < LIMITS.shift:
+        return []
+    size = significant(float(np.linalg.norm(stiffness)), 2)
+    name = robot.joint_names[joint]
+    length = significant(1e3 * shift, 2)
+    unit = robot.joint_unit(joint)
+    text = (
+        f"the moments follow `{name}` by {size} N m for each {unit}, "
+        "like those of a cable that pulls at the load: they shift its centre by "
+        f"{length} mm. Lead the cable away from the sensor, or keep this joint still."
+    )
+    return [Remark(text, Status.DOUBTFUL)]
 
 
 def _lever(wrench: SensorRows) -> float:

@@ -147,6 +147,15 @@ def test_a_wrench_that_is_not_the_one_described_is_named_by_gravity(time):
     inertial = wrench(time, turn=0 * TURN) - np.hstack([weight, moment])
     (compensated,) = findings(time, noisy(inertial, 4))
     assert "gravity of the load is missing" in compensated.text
+    (half,) = findings(time, noisy(inertial + np.hstack([weight, moment]) / 2, 4))
+    assert "51 % of the gravity" in half.text
+    (units,) = findings(time, noisy(right, 1) * [1, 1, 1, 1000, 1000, 1000])
+    assert "N mm" in units.text
+    columns, _ = findings(time, noisy(right, 1)[:, [1, 0, 2, 4, 3, 5]])
+    assert "left-handed" in columns.text
+    cable = np.outer(poses(time, 1.0)[:, -1], [0, 0, 0, 0.07, -0.03, 0.065])
+    (pulled,) = findings(time, noisy(right + cable, 7))
+    assert f"follow `{ROBOT.joint_names[-1]}` by 0.099 N m" in pulled.text
     tared = right - right[40]
     noise = np.random.default_rng(5).normal(size=tared.shape) * 0.02
     (zeroed,) = findings(time, tared + noise)
