@@ -65,12 +65,12 @@ def _times(matrices: Array, x: Array):
     return jnp.einsum("nij,nj->ni", matrices, x)
 
 
-def moved_by(robot: Robot) -> np.ndarray:
+def moved_by(robot: Robot, dtype: Any) -> Array:
     """Return 1 where a body (row) is moved by a joint (column), else 0."""
     is_moved = np.zeros((robot.bodies, robot.bodies))
     for body, chain in enumerate(robot.ancestors):
         is_moved[body, list(chain)] = 1.0
-    return is_moved
+    return jnp.asarray(is_moved, dtype)
 
 
 def all_placements(robot: Robot, q: Joints) -> Array:
@@ -151,7 +151,7 @@ def ground_motion(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> GroundMot
     linear_velocities = _times(arm, turning_axes) + _times(R, sliding_axes)
     joints = jnp.concatenate([angular_velocities, linear_velocities], axis=1)
 
-    is_moved = jnp.asarray(moved_by(robot), dtype)
+    is_moved = moved_by(robot, dtype)
     if robot.rigid:
         joints_at_rest = _zeros_at(robot.rigid, robot, dtype)[: robot.joints]
         qd = qd * joints_at_rest
@@ -184,7 +184,7 @@ def spatial_forces(
     rates = jnp.einsum("nji,nj->ni", _combine(CROSS, v), momenta)
     wrenches = _times(inertias, a) - rates
     # A joint feels the wrenches of all bodies that it moves (Newton and Euler).
-    moved_wrenches = jnp.asarray(moved_by(robot).T, q.dtype) @ wrenches
+    moved_wrenches = moved_by(robot, q.dtype).T @ wrenches
     joint_forces = jnp.sum(joints * moved_wrenches, axis=1)
     return on_coordinates(robot, q, joint_forces)
 
@@ -195,7 +195,7 @@ def spatial_mass_matrix(robot: Robot, p: Bodies, q: Joints) -> JointMatrix:
     standstill = jnp.zeros_like(q)
     motion = ground_motion(robot, q, standstill, standstill)
     inertias = ground_inertias(p, motion.carry)
-    is_moved = jnp.asarray(moved_by(robot), q.dtype)
+    is_moved = moved_by(robot, q.dtype)
     # All bodies beyond a joint move as one when that joint alone moves.
     composite = jnp.tensordot(is_moved.T, inertias, 1)
     momenta = _times(composite, motion.joints)
@@ -223,5 +223,5 @@ def spatial_regressor(robot: Robot, q: Joints, qd: Joints, qdd: Joints) -> Array
     wrenches = carry @ body_wrenches
     columns = jnp.einsum("js,bsk->jbk", joints, wrenches)
     # A joint feels only the bodies that it moves.
-    is_moved = jnp.asarray(moved_by(robot).T, q.dtype)
+    is_moved = moved_by(robot, q.dtype).T
     return on_coordinates(robot, q, is_moved[:, :, None] * columns)
