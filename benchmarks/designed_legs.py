@@ -1,12 +1,13 @@
 """Designed motions of robots on legs, played on MuJoCo, beside a plan made by hand.
 
-`jaxid excite` designs the motion of a quadruped from the masses of its file, with
-default settings. MuJoCo plays it with controllers of the joints (`floating.py`: rotors,
-friction, noise). Does the robot fall, do feet stay, are the flags as planned? And what
-does the log tell, compared with the plan of `floating.py` of the same duration?
+`jaxid excite` designs the motion of a robot from the masses of its file, with default
+settings. MuJoCo plays it with controllers of the joints, which add the forces of the
+table (`floating.py`: rotors, friction, noise). Does the robot fall, do feet stay, are
+the flags as planned? And what does the log of a quadruped tell, compared with the plan
+of `floating.py` of the same duration, and that of a humanoid?
 
     python benchmarks/designed_legs.py                 # Go2, ANYmal C, A1: 10 minutes
-    python benchmarks/designed_legs.py --robot A1 --seconds 60
+    python benchmarks/designed_legs.py --robot G1 --seconds 60
 """
 
 import argparse
@@ -18,6 +19,8 @@ import jax
 import numpy as np
 from floating import (
     ANYMAL,
+    COLUMNS,
+    G1,
     GO2,
     ROBOTS,
     SAMPLE_TIME,
@@ -25,6 +28,8 @@ from floating import (
     Study,
     recording,
     simulate,
+    total_mass_row,
+    write,
 )
 from timing import Row, hand_over
 
@@ -45,7 +50,11 @@ SETTLING_TIME = (
 
 def design(robot: Legged, seconds: float) -> Any:
     """Return the motion that the command designs with an experiment file."""
-    contacts = [f"{foot} = {shape.radius}" for foot, shape in robot.feet.items()]
+    quoted_sole = '"sole"'
+    contacts = [
+        f"{foot} = {getattr(shape, 'radius', quoted_sole)}"
+        for foot, shape in robot.feet.items()
+    ]
     text = (
         f'[robot]\nurdf = "{ROBOTS / robot.path}"\nfloating = true\n'
         f"contacts = {{ {', '.join(contacts)} }}\n"
@@ -126,17 +135,55 @@ def compare(name: str, seconds: float) -> list[Row]:
         values = (
             f"{1e3 * (mass - total):.0f} ± {1e3 * width:.0f} g of {total:.2f} kg; "
             f"{100 * error:.2f} %; {100 * study.coverage(fit):.0f} %; "
-            f"{len(fit.undetermined)}; {np.exp(widths.mean()):.5f}"
+            f"{len(plan.undetermined)} predicted, {len(fit.undetermined)}; "
+            f"{np.exp(widths.mean()):.5f}"
         )
         what = "mass error; torque error; coverage; open; mean interval"
         rows.append((f"{kind}: {what}", "", values, error < 4e-3))
     return [Row("43", f"{name}: {what}", recipe, *rest) for what, *rest in rows]
 
 
+def humanoid(seconds: float) -> list[Row]:
+    """Play a designed motion of G1, and identify its total mass."""
+    plan = design(G1, seconds)
+    motion = plan.trajectory
+    log = simulate(G1, 1, float(motion.duration), motion=motion)
+    lowest = float(log["up"].min())
+    flags = wrong_flags(log, motion, SAMPLE_TIME * np.arange(len(log["up"])))
+    setup = jid.Setup(G1.load())
+    with tempfile.TemporaryDirectory() as folder:
+        path = write(log, Path(folder) / "log.csv", 1)
+        report = jid.identify_logs(setup, [path], COLUMNS)
+    total = total_mass_row(setup.base)
+    truth = total @ setup.base.from_standard(G1.truth(setup.base.model))
+    fit = report.fit
+    mass = float(total @ fit.parameters)
+    width = 2.0 * float(np.sqrt(total @ fit.uncertainty.covariance @ total))
+    error = abs(mass / truth - 1.0)
+    values = [
+        ("upright: least cosine of the tilt", "0.9", f"{lowest:.3f}", lowest > 0.9),
+        ("flags not as planned", "2 %", f"{100 * flags:.2f} %", flags < 0.02),
+        (
+            f"total mass of {truth:.2f} kg",
+            "0.3 %",
+            f"{mass:.3f} ± {width:.3f} kg, {100 * error:.2f} %",
+            error < 3e-3,
+        ),
+        (
+            "open: predicted, identified",
+            "-",
+            f"{len(plan.undetermined)}, {len(fit.undetermined)}",
+            None,
+        ),
+    ]
+    recipe = f"designed_legs.py --robot G1, search of {seconds:g} s"
+    return [Row("43", f"G1: {what}", recipe, *rest) for what, *rest in values]
+
+
 if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--quick", action="store_true")
-    parser.add_argument("--robot", choices=[*QUADRUPEDS])
+    parser.add_argument("--robot", choices=[*QUADRUPEDS, "G1"])
     parser.add_argument("--seconds", type=float, default=60.0, help="for a search")
     parser.add_argument("--json")
     options = parser.parse_args()
@@ -145,7 +192,8 @@ if __name__ == "__main__":
         names = ["Go2"]
     rows = []
     for name in names:
-        rows += compare(name, 10.0 if options.quick else options.seconds)
+        seconds = 10.0 if options.quick else options.seconds
+        rows += humanoid(seconds) if name == "G1" else compare(name, seconds)
         for row in rows[-6:]:
             print(row, flush=True)
     hand_over(rows, options.json)

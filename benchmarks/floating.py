@@ -110,6 +110,9 @@ G1 = Legged(
     armature=0.02,
     damping=0.3,
     friction=0.3,
+    stiffness=500.0,
+    rate_gain=10.0,
+    torque=120.0,
     sole=(0.085, 0.03, 0.01),
 )
 QUADRUPEDS = {"Go2": GO2, "ANYmal C": ANYMAL}
@@ -266,13 +269,14 @@ class Designed:
         self.robot = robot
         self.angles = np.asarray(samples.q)[:, order]
         self.rates = np.asarray(samples.qd)[:, order]
+        self.forces = np.asarray(motion.feed_forward(times))[:, order]
         self.stand = np.r_[np.zeros(7), self.angles[0]]
 
     def torques(self, d: Any, t: float) -> np.ndarray:
-        """Return the torques of the drives, which follow angles and velocities."""
+        """Return the torques of the drives: forces of the table, and corrections."""
         robot = self.robot
         k = min(int(t / CONTROL_STEP + 1e-6), len(self.angles) - 1)
-        torque = robot.stiffness * (self.angles[k] - d.qpos[7:])
+        torque = self.forces[k] + robot.stiffness * (self.angles[k] - d.qpos[7:])
         torque += robot.rate_gain * (self.rates[k] - d.qvel[6:])
         return np.clip(torque, -robot.torque, robot.torque)
 
@@ -306,7 +310,7 @@ def simulate(
     mujoco.mj_forward(m, d)
     half_height = m.geom_size[feet[0], 2 if robot.sole else 0]
     d.qpos[2] -= min(d.geom_xpos[g, 2] for g in feet) - half_height
-    if robot.sole is not None:
+    if robot.sole is not None and motion is None:
         mujoco.mj_forward(m, d)
         plan = Balance(m, d, feet, seed)
     keys = ("angles", "forces", "gyro", "accelerometer", "contact", "up", "feet")

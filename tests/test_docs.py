@@ -25,9 +25,9 @@ from true_arm import TrueArm, ball_sessions, true_origins
 
 import jaxid as jid
 from jaxid.cli import app as cli
+from jaxid.dynamics.open_directions import OPEN_SHARES
 from jaxid.experiment_file import KEYS
 from jaxid.experiment_values import decode_table
-from jaxid.identification.determination import OPEN_SHARES
 from jaxid.program.sample_methods import in_numpy
 from jaxid.simulation.virtual import random_bodies
 from jaxid.validation.judgement import ERRORS, MAX_CONDITION_NUMBER

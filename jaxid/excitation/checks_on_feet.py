@@ -11,11 +11,9 @@ from jaxid.robot.limits_and_drives import Limits
 from jaxid.robot.virtual_joints import GROUP, with_moving_base
 
 from .constraints import AbstractConstraint, Finding
-from .ground_forces import ground_forces, measured_motion
-from .motions_on_feet import MotionsOnFeet
+from .ground_forces import GroundForces
+from .motions_on_feet import MotionsOnFeet, Phase
 
-LENGTH = 0.1
-"""Length that counts as an excess of one [m]."""
 MIN_JOINT_HEIGHT = 0.02
 """Height of the joints of legs above the ground, but for those of a sole [m]."""
 
@@ -51,14 +49,17 @@ class ChecksOnFeet(NamedTuple):
     limits: Limits
     constraints: tuple[AbstractConstraint, ...]
 
-    def __call__(self, motion: Motion, stands: AnyArray) -> CheckedMotion:
-        """Return how far a motion uses the limits.
-
-        Args:
-            motion: Motion of trunk and joints on the ground.
-            stands: Whether each foot stands [samples feet].
-        """
-        findings = self._falling(motion, stands)
+    def __call__(self, phase: Phase, times: AnyArray) -> CheckedMotion:
+        """Return how far a phase uses the limits at times from its start [s]."""
+        motion = phase.motion(times)
+        loads = self.motions.loads(phase.number, times)
+        forces = self.motions.forces(motion, loads)
+        findings = [
+            self._balance(forces, loads > 0.0),
+            self._friction(forces),
+            self._height(motion),
+            *self._forces(forces),
+        ]
         robot = with_moving_base(self.motions.robot)
         for constraint in self.constraints:
             excess = np.asarray(constraint(robot, motion)).max(axis=0)
@@ -79,65 +80,68 @@ class ChecksOnFeet(NamedTuple):
         largest_use = [np.abs(x).max(axis=0) for x in uses]
         return np.stack([*largest_use, np.zeros_like(largest_use[0])])
 
-    def _falling(self, motion: Motion, stands: AnyArray) -> list[Finding]:
-        """Return balance and friction of the feet, and heights and forces of joints."""
+    def _balance(self, forces: GroundForces, stands: np.ndarray) -> Finding:
+        """Return how near the zero-moment point comes to the border of the feet."""
         motions = self.motions
-        standing = motions.standing
-        trunk = measured_motion(motions.robot, motion)
-        ground = ground_forces(motions.base, standing.parameters, trunk, stands)
-        room = np.inf
+        rooms = []
         for flags in np.unique(stands, axis=0):
-            points = ground.zero_moment_point[(stands == flags).all(axis=1)]
-            room = min(room, motions.support(points, flags).min())
-        friction = standing.friction
-        findings = [
-            Finding(
-                "the distance of the zero-moment point from the border of the feet",
-                1.0,
-                "of that of their middle",
-                standing.margin,
-                is_lower_limit=True,
-                value=standing.margin - room,
-            ),
-            Finding(
-                "the force along the ground",
-                friction,
-                "of that against it",
-                friction,
-                value=ground.friction.max() / friction - 1.0,
-            ),
-            self._height(np.asarray(motion.q)),
-        ]
-        max_forces = np.asarray(motions.robot.known_max_forces)
-        peaks = np.abs(ground.joint_forces).max(axis=0)
-        margin = standing.force_margin
+            points = forces.zero_moment_point[(stands == flags).all(axis=1)]
+            rooms.append(motions.support(points, flags).min())
+        margin = motions.standing.margin
+        return Finding(
+            "the distance of the zero-moment point from the border of the feet",
+            100.0,
+            "% of that of their middle",
+            100.0 * margin,
+            is_lower_limit=True,
+            value=margin - min(rooms),
+        )
+
+    def _friction(self, forces: GroundForces) -> Finding:
+        """Return how near the feet come to slipping."""
+        friction = self.motions.standing.friction
+        return Finding(
+            "the force along the ground",
+            friction,
+            "of that against it",
+            friction,
+            value=forces.friction.max() / friction - 1.0,
+        )
+
+    def _forces(self, forces: GroundForces) -> list[Finding]:
+        """Return the forces of the joints whose limits are known."""
+        robot = self.motions.robot
+        share = 1.0 - self.motions.standing.force_margin
+        max_forces = np.asarray(robot.known_max_forces)
+        peaks = np.abs(forces.joint_forces).max(axis=0)
+        findings = []
         for joint in np.flatnonzero(np.isfinite(max_forces)).tolist():
-            limit = (1.0 - margin) * max_forces[joint]
-            note = f"{max_forces[joint]:.4g} less a margin of {100 * margin:.4g} %"
+            limit = share * max_forces[joint]
+            note = f"{max_forces[joint]:.4g} less a margin of {100 * (1 - share):.4g} %"
             findings.append(
                 Finding(
-                    f"the force of joint `{motions.robot.joint_names[joint]}`",
+                    f"the force of joint `{robot.joint_names[joint]}`",
                     limit,
-                    motions.robot.force_unit(joint),
+                    robot.force_unit(joint),
                     limit,
-                    note=note if margin else "",
+                    note=note if share < 1.0 else "",
                     value=peaks[joint] / limit - 1.0,
                 )
             )
         return findings
 
-    def _height(self, q: np.ndarray) -> Finding:
+    def _height(self, motion: Motion) -> Finding:
         """Return the height of the legs' joints, without those near a sole."""
         heights = []
         for leg in self.motions.legs:
             upper_joints = leg.joints[: (len(leg.joints) + 3) // 2]
-            tip = tip_jacobian(leg.foot, q)
+            tip = tip_jacobian(leg.foot, motion.q)
             heights.append(tip.origins[:, upper_joints, 2].min())
         return Finding(
             "the height of the legs' joints above the ground",
-            LENGTH,
+            1.0,
             "m",
             MIN_JOINT_HEIGHT,
             is_lower_limit=True,
-            value=(MIN_JOINT_HEIGHT - min(heights)) / LENGTH,
+            value=MIN_JOINT_HEIGHT - min(heights),
         )

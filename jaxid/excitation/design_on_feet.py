@@ -17,6 +17,7 @@ import numpy as np
 from jaxid.arrays import PRNGKeyArray
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.contact_elimination import contact_mask, elimination
+from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.robot.limits_and_drives import Limits, complete_limits
 from jaxid.robot.virtual_joints import GROUP, driven_robot
@@ -36,12 +37,13 @@ NOISE_SHARE = 0.01
 """Noise of the force on the base, relative to the weight."""
 GUARD = 0.5
 """Time around a change of contact whose samples are not counted on [s]."""
-SHRINKAGE = 0.8
-"""Factor by which a motion is made smaller until it keeps all limits."""
-FOOT_EXPONENT = 0.5
-"""Power of this factor for a foot in the air, whose motion shakes the trunk less."""
+SHRINKAGE = 0.5
+"""Factor by which half of the coordinates are made smaller until all limits are kept.
+"""
 MAX_SHRINKAGES = 12
-"""Times that it is; then it becomes a motion without waves."""
+"""Times that they are; then the motion becomes one without waves."""
+MAX_NAMED = 3
+"""Limits that are named if a robot cannot keep them."""
 CHANGED_SHARE = 0.3
 """Share of the coordinates that a change of a motion replaces."""
 MIN_DURATION = 1e-3
@@ -106,8 +108,9 @@ class DesignOnFeet:
                 f"{joints.joints} driven joints, but is {joint_noise}."
             )
         # Also 1 % of the weight, and of its moment about the ground.
-        rest = self.motions.phase(0, np.zeros(self.motions.shape))
-        trunk = measured_motion(base.model.robot, rest.motion(np.zeros(1)))
+        pose = self.motions.pose[None]
+        rest = Motion(pose, 0.0 * pose, 0.0 * pose)
+        trunk = measured_motion(base.model.robot, rest)
         weight = base.forces_in_numpy(standing.parameters, trunk.motion)[0, 2]
         force_noise = np.full(3, NOISE_SHARE * weight)
         moment_noise = force_noise * self.motions.pose[2]
@@ -115,23 +118,20 @@ class DesignOnFeet:
         self.samples = samples
         self.prior = 0.0 if prior is None else np.asarray(prior)
         self.sizes = np.ones(base.size)
-        # Times that random motions of each phase are made smaller from the outset.
-        self.shrinkages = [0] * self.motions.phases
         self._value = jax.jit(self.criterion)
 
     def information(self, phase: Phase) -> Information:
         """Return what the samples of a phase tell."""
         motions = self.motions
         times = motions.times
-        stands = phase.stands(times, len(motions.legs))
+        stands = motions.loads(phase.number, times) > 0.0
         trunk = measured_motion(motions.robot, phase.motion(times))
         X = elimination(motions.robot, trunk.motion.q, trunk.up, stands)
         motion = dataclasses.replace(trunk.motion, contacts=X)
         mask = contact_mask(motions.robot, motion)
-        if phase.foot is not None:
-            distances = np.abs(times[:, None] - np.array(phase.lift))
-            is_near = (distances <= GUARD).any(axis=1)
-            mask[is_near] = False
+        changes = np.flatnonzero(np.diff(stands.all(axis=1)))
+        distances = np.abs(times[:, None] - times[changes])
+        mask[(distances <= GUARD).any(axis=1)] = False
         rows = np.asarray(self.base.regressor(motion))
         # The samples of one run are shared by all phases.
         share = self.samples / motions.phases / len(times)
@@ -159,42 +159,34 @@ class DesignOnFeet:
         count = CHECKED_INSTANTS // self.motions.phases
         return np.linspace(0.0, self.motions.duration, count)
 
-    def check(self, phase: Phase, times: np.ndarray) -> CheckedMotion:
-        """Check a phase at times from its start [s]."""
-        stands = phase.stands(times, len(self.motions.legs))
-        return self.checks(phase.motion(times), stands)
-
-    def shrunk(self, waves: np.ndarray, times: int) -> np.ndarray:
-        """Return waves that are made smaller some times, those of the foot less."""
-        factors = np.full((len(waves), 1), SHRINKAGE**times)
-        factors[-GROUP:] **= FOOT_EXPONENT
-        return factors * waves
-
     def candidate(
-        self, number: int, coefficients: np.ndarray, times: np.ndarray
+        self,
+        number: int,
+        coefficients: np.ndarray,
+        times: np.ndarray,
+        random: np.random.Generator,
     ) -> Candidate:
         """Return a phase that is made smaller until it keeps all limits at some times.
+
+        Which coordinates exceed a limit is not known: random ones are made smaller.
 
         Raises:
             InputError: If not even the lean and the lift alone keep them.
         """
-        motions = self.motions
         checked = None
-        for k in range(MAX_SHRINKAGES + 1):
-            smaller_waves = self.shrunk(coefficients, k)
-            if k == MAX_SHRINKAGES:
-                smaller_waves = np.zeros_like(coefficients)
-            phase = motions.phase(number, smaller_waves)
-            if phase.spline is None:
-                continue
-            checked = self.check(phase, times)
-            if checked.violation <= 0.0:
-                shrinkages = self.shrinkages[number] + k - 1
-                self.shrinkages[number] = max(shrinkages, 0)
-                return Candidate(phase, self.information(phase))
+        for attempt in range(MAX_SHRINKAGES + 1):
+            if attempt == MAX_SHRINKAGES:
+                coefficients = np.zeros_like(coefficients)
+            phase = self.motions.phase(number, coefficients)
+            if phase.spline is not None:
+                checked = self.checks(phase, times)
+                if checked.violation <= 0.0:
+                    return Candidate(phase, self.information(phase))
+            is_smaller = random.uniform(size=(len(coefficients), 1)) < 0.5
+            coefficients = np.where(is_smaller, SHRINKAGE, 1.0) * coefficients
         raise InputError(
-            f"`{motions.robot.name}` cannot move in phase {number + 1} of "
-            f"{motions.phases} (all feet stand, then each is lifted in its turn), "
+            f"`{self.motions.robot.name}` cannot move in phase {number + 1} of "
+            f"{self.motions.phases} (all feet stand, then each is lifted in its turn), "
             f"however little it sways: {self._reason(checked)}."
         )
 
@@ -202,28 +194,37 @@ class DesignOnFeet:
         """Return which limits a motion exceeds."""
         if checked is None:
             return "a leg cannot reach its place; give a `pose` with knees bent more"
-        sentences = [str(x) for x in checked.findings if x.value > 0]
+        findings = [x for x in checked.findings if x.value > 0]
+        findings.sort(key=lambda finding: -finding.value)
+        sentences = [str(x) for x in findings[:MAX_NAMED]]
+        if len(findings) > MAX_NAMED:
+            sentences.append(f"{len(findings) - MAX_NAMED} more")
         largest_use = checked.use.max(axis=0)
         joint = int(largest_use.argmax())
         if largest_use[joint] > 1.0:
             name = self.motions.robot.joint_names[GROUP + joint]
             sentences.append(f"joint `{name}` exceeds its range, speed or acceleration")
-        return "; ".join(sentences)
+        return f"{'; '.join(sentences)}; give another `pose`"
 
-    def candidates(self, waves: Sequence[np.ndarray]) -> list[Candidate]:
+    def candidates(
+        self, waves: Sequence[np.ndarray], random: np.random.Generator
+    ) -> list[Candidate]:
         """Return a candidate of each phase, which keeps its limits on a fine grid."""
-        return [self.candidate(k, x, self.instants) for k, x in enumerate(waves)]
+        return [
+            self.candidate(k, x, self.instants, random) for k, x in enumerate(waves)
+        ]
 
     def keeps_limits(self, phase: Phase) -> bool:
         """Return whether a phase keeps its limits on a fine grid."""
-        return self.check(phase, self.instants).violation <= 0.0
+        return self.checks(phase, self.instants).violation <= 0.0
 
     def change(
         self, waves: np.ndarray, new_waves: np.ndarray, random: np.random.Generator
     ) -> np.ndarray:
         """Return waves of which some coordinates are replaced, the others scaled."""
         is_new = random.uniform(size=(len(waves), 1)) < CHANGED_SHARE
-        return np.where(is_new, new_waves, random.uniform(0.8, 1.3) * waves)
+        scaled_waves = random.uniform(0.8, 1.3) * waves
+        return self.motions.bounded(np.where(is_new, new_waves, scaled_waves))
 
     def plan(
         self,
@@ -234,7 +235,7 @@ class DesignOnFeet:
     ) -> ExcitationPlan:
         """Return the result of the search."""
         motions = self.motions
-        checks = [self.check(x.phase, self.instants) for x in candidates]
+        checks = [self.checks(x.phase, self.instants) for x in candidates]
         findings = [
             max(entries, key=lambda finding: finding.value)
             for entries in zip(*(x.findings for x in checks), strict=True)
@@ -253,6 +254,7 @@ class DesignOnFeet:
             findings=tuple(findings),
             status=status,
             history=np.asarray(history),
+            parameters=motions.standing.parameters,
         )
 
 
@@ -281,25 +283,24 @@ def design_on_feet(
     shape = (motions.phases, *motions.shape)
     if begin is not None and begin.coefficients.shape != shape:
         raise InputError("`begin` must be a motion of the same robot and settings.")
-    waves = [motions.random(number, random) for number in numbers]
-    candidates = design.candidates(waves)
+    waves = [motions.random(random) for _ in numbers]
+    candidates = design.candidates(waves, random)
     design.sizes = typical_sizes(design.total(candidates))
     reference = design.total(candidates)
     if begin is not None:
-        candidates = design.candidates([*np.asarray(begin.coefficients)])
+        candidates = design.candidates([*np.asarray(begin.coefficients)], random)
     trajectory = motions.trajectory([x.phase for x in candidates])
     history = [design.value(candidates)]
     steps = starts + CHANGES * motions.phases * generations
     try:
         for step in range(steps):
             number = step % motions.phases
-            new_waves = motions.random(number, random)
-            new_waves = design.shrunk(new_waves, design.shrinkages[number])
+            new_waves = motions.random(random)
             if step >= starts:
                 waves = candidates[number].phase.coefficients
                 new_waves = design.change(waves, new_waves, random)
             others = candidates.copy()
-            others[number] = design.candidate(number, new_waves, motions.times)
+            others[number] = design.candidate(number, new_waves, motions.times, random)
             value = design.value(others)
             if value < history[-1] and design.keeps_limits(others[number].phase):
                 candidates = others

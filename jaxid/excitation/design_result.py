@@ -11,8 +11,15 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Texts, double_precision
+from jaxid.arrays import AnyArray, Float, double_precision
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.open_directions import (
+    OPEN_SHARES,
+    UndeterminedDirection,
+    open_directions,
+    random_rows,
+    status_of,
+)
 from jaxid.result_table import (
     MISSING,
     Column,
@@ -31,10 +38,19 @@ from jaxid.trajectory.trajectory import LinearTrajectory
 
 from .constraints import Finding
 from .criteria import CRITERIA, AbstractCriterion, Information, standard_deviations
-from .criteria.information_matrix import BaseVector, JointVector
+from .criteria.information_matrix import (
+    RANK_TOLERANCE,
+    BaseVector,
+    JointVector,
+    scale_to_unit_diagonal,
+)
 
-MAX_OPEN_NOISE = 10.0
-"""Forces that a parameter may leave open on a random motion, over the noise (RMS)."""
+INTERVAL = 1.96
+"""Half a 95 % interval over the standard deviation."""
+USUAL_NOISE = 0.01
+"""Noise over the largest forces, where nothing else is known."""
+MAX_NAMED = 3
+"""Combinations that are left open and named, the weakest ones."""
 
 
 class DesignStatus(enum.StrEnum):
@@ -104,6 +120,7 @@ class ExcitationPlan(Summarised, eqx.Module):
         status: How the design ended.
         history: Value of the criterion for the best motion, before the first step and
             after each.
+        parameters: Nominal values of the base parameters; None if nothing is known.
     """
 
     base: BaseParameters
@@ -119,6 +136,7 @@ class ExcitationPlan(Summarised, eqx.Module):
     findings: tuple[Finding, ...]
     status: DesignStatus = eqx.field(static=True)
     history: Float[AnyArray, " steps"]
+    parameters: BaseVector | None = None
 
     @property
     def interrupted(self) -> bool:
@@ -177,18 +195,53 @@ class ExcitationPlan(Summarised, eqx.Module):
         """Robot of the joints that move: of one on its feet, those that are driven."""
         return driven_robot(self.base.model.robot)
 
-    @property
-    def undetermined(self) -> Texts:
-        """Names of base parameters that this motion cannot determine.
+    @functools.cached_property
+    def undetermined(self) -> tuple[UndeterminedDirection, ...]:
+        """Combinations that one run leaves open, by the rule of `jaxid identify`.
 
-        Their deviations make forces that are more than ten times the noise (RMS), a
-        tenth of the largest forces with the usual noise, on random motions that fill
-        the limits of the joints.
+        Its 95 % interval makes more than a tenth of the forces of random motions
+        uncertain: of the forces by nominal parameters, or of the largest forces, which
+        are 100 times the usual noise, where nothing is known of those.
         """
-        rows = self.samples * len(self.noise)
-        column_rms = 1.0 / (np.asarray(self.information.sizes) * np.sqrt(rows))
-        is_open = ~(self.standard_deviations * column_rms <= MAX_OPEN_NOISE)
-        return tuple(self.base.names[k] for k in np.flatnonzero(is_open))
+        matrix, scale = scale_to_unit_diagonal(np.asarray(self.information.weighted))
+        squares, directions = np.linalg.eigh(matrix)
+        has_information = squares >= RANK_TOLERANCE * squares[-1]
+        values = np.sqrt(np.where(has_information, squares, 0.0))
+        with np.errstate(divide="ignore"):
+            half_widths = INTERVAL / values
+        with double_precision():
+            largest_forces = np.asarray(self.noise) / USUAL_NOISE
+            rows = random_rows(self.base, self.parameters, largest_forces)
+        return open_directions(directions.T, 1.0 / scale, values, half_widths, rows)
+
+    @property
+    def open_share(self) -> float:
+        """Largest share of the forces of random motions that is left open."""
+        return max(
+            (direction.uncertainty for direction in self.undetermined), default=0
+        )
+
+    @property
+    def determination(self) -> list[Remark]:
+        """What one run leaves open by the rule of `jaxid identify`, and the cure."""
+        count = len(self.undetermined)
+        if not count:
+            return []
+        size = self.base.size
+        runs = (self.open_share / OPEN_SHARES.doubtful) ** 2
+        cure = "some of which it does not move at all"
+        if math.isfinite(runs):
+            cure = (
+                f"which make up to {100 * self.open_share:.2g} % of the forces of "
+                f"other motions uncertain: {math.ceil(runs)} runs of this motion "
+                f"determine all, or one with {runs**-0.5:.2g} times the assumed noise"
+            )
+        text = f"One run leaves {count} combinations of {size} parameters open, {cure}"
+        remarks = [Remark(text, status_of(self.open_share))]
+        for direction in self.undetermined[:MAX_NAMED]:
+            text = f"left open: {direction.sentence(self.base)}"
+            remarks.append(Remark(text, status_of(direction.uncertainty)))
+        return remarks
 
     @property
     def occasion(self) -> str:
@@ -253,9 +306,7 @@ class ExcitationPlan(Summarised, eqx.Module):
             remark = Remark(text, Status.DOUBTFUL)
         remarks = [remark]
         remarks += [Remark(text, Status.BAD) for text in self.diagnosis]
-        if self.undetermined:
-            text = f"This motion does not determine: {', '.join(self.undetermined)}"
-            remarks.append(Remark(text, Status.BAD))
+        remarks += self.determination
         if self.interrupted:
             text = "The design was stopped early"
             remarks.append(Remark(text, Status.DOUBTFUL))

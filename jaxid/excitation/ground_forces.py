@@ -1,14 +1,14 @@
 """Forces between the feet of a robot and level ground, by nominal parameters.
 
 Their sum follows from the motion. How the feet share it does not: the smallest forces
-are taken.
+are taken, of which those of a foot count the more the less weight it is to carry.
 """
 
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray
+from jaxid.arrays import AnyArray, Float
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.contact_elimination import contact_jacobians, contact_tips
 from jaxid.dynamics.motion import Motion, floating_motion
@@ -22,18 +22,32 @@ MOMENT_ARM = 0.05
 """Length by which a moment of a sole counts like a force [m]."""
 
 
+class GroundForces(NamedTuple):
+    """Forces of the ground, and those of the joints.
+
+    Attributes:
+        zero_moment_point: Point of the ground about which the forces of the ground have
+            no horizontal moment [samples 2] [m].
+        friction: Force along the ground, relative to that against it [samples].
+        joint_forces: Forces of all joints, nearly zero for virtual ones [samples
+            joints] [N m or N].
+    """
+
+    zero_moment_point: np.ndarray
+    friction: np.ndarray
+    joint_forces: np.ndarray
+
+
 class BaseMotion(NamedTuple):
     """Motion of a robot whose trunk moves on the ground.
 
     Attributes:
         motion: Motion as an IMU in the origin of the trunk measures it.
         rotation: Attitudes of the trunk on the ground [samples 3 3].
-        position: Positions of its origin [samples 3] [m].
     """
 
     motion: Motion
     rotation: np.ndarray
-    position: np.ndarray
 
     @property
     def up(self) -> np.ndarray:
@@ -57,33 +71,17 @@ def measured_motion(robot: Robot, ground_motion: Motion) -> BaseMotion:
         turning += qdd[:, joint, None] * axis + np.cross(spin, rate)
         spin += rate
     vectors = np.stack([qdd[:, :3] - GRAVITY, spin, turning])
-    motion = floating_motion(
-        q[:, GROUP:],
-        qd[:, GROUP:],
-        qdd[:, GROUP:],
-        *np.einsum("nji,knj->kni", tip.rotation, vectors),
-    )
-    return BaseMotion(motion, tip.rotation, tip.position)
-
-
-class GroundForces(NamedTuple):
-    """Forces of the ground, and those of the joints.
-
-    Attributes:
-        zero_moment_point: Point of the ground about which the forces of the ground have
-            no horizontal moment [samples 2] [m].
-        friction: Force along the ground, relative to that against it [samples].
-        joint_forces: Forces of all joints, nearly zero for virtual ones [samples
-            joints] [N m or N].
-    """
-
-    zero_moment_point: np.ndarray
-    friction: np.ndarray
-    joint_forces: np.ndarray
+    along_trunk = np.einsum("nji,knj->kni", tip.rotation, vectors)
+    joints = (x[:, GROUP:] for x in (q, qd, qdd))
+    return BaseMotion(floating_motion(*joints, *along_trunk), tip.rotation)
 
 
 def ground_forces(
-    base: BaseParameters, parameters: AnyArray, trunk: BaseMotion, stands: AnyArray
+    base: BaseParameters,
+    parameters: AnyArray,
+    trunk: BaseMotion,
+    loads: Float[np.ndarray, "samples feet"],
+    feet: Float[np.ndarray, "feet 2"],
 ) -> GroundForces:
     """Return the forces of a motion.
 
@@ -91,33 +89,38 @@ def ground_forces(
         base: Base parameters.
         parameters: Their nominal values.
         trunk: Motion of the robot.
-        stands: Whether each foot stands [samples feet].
+        loads: How much of the weight each foot is to carry, from 0 (in the air) to 1.
+        feet: Places of the feet while they stand [m].
     """
     forces = base.forces_in_numpy(parameters, trunk.motion)
-    force, moment = np.einsum(
-        "nij,nkj->kni", trunk.rotation, forces[:, :GROUP].reshape(-1, 2, 3)
-    )
-    x, y, height = trunk.position.T
-    point = np.stack(
-        [
-            x - (moment[:, 1] + height * force[:, 0]) / force[:, 2],
-            y + (moment[:, 0] - height * force[:, 1]) / force[:, 2],
-        ],
-        axis=1,
-    )
-    friction = np.linalg.norm(force[:, :2], axis=1) / force[:, 2]
     robot = base.model.robot
     tips = contact_tips(robot, trunk.motion.q)
     jacobians = contact_jacobians(robot, tips, trunk.up)
-    scale = np.array([1.0, 1.0, 1.0, *[MOMENT_ARM] * 3])
+    directions = jacobians[0].shape[2]
+    scale = np.array([1.0, 1.0, 1.0, *[MOMENT_ARM] * 3])[:directions]
+    weights = loads[:, :, None] * scale
     parts = [
-        scale[: jacobian.shape[2]] * jacobian * stands[:, foot, None, None]
-        for foot, jacobian in enumerate(jacobians)
+        jacobian * weights[:, foot, None] for foot, jacobian in enumerate(jacobians)
     ]
     effects = np.concatenate(parts, axis=2)
-    inverse = np.linalg.pinv(effects[:, :GROUP], rcond=1e-9)
-    carried = effects @ inverse @ forces[:, :GROUP, None]
-    return GroundForces(point, friction, forces - carried[..., 0])
+    base_effects = effects[:, :GROUP]
+    squares = base_effects @ base_effects.swapaxes(1, 2)
+    multipliers = np.linalg.solve(squares, forces[:, :GROUP, None])
+    shares = base_effects.swapaxes(1, 2) @ multipliers
+    carried = (effects @ shares)[..., 0]
+
+    along_trunk = shares.reshape(weights.shape) * weights
+    vectors = along_trunk.reshape(*loads.shape, directions // 3, 3)
+    contact_forces = np.einsum("nij,nfkj->nfki", trunk.rotation, vectors)
+    along_x, along_y, vertical = np.moveaxis(contact_forces[:, :, 0], 2, 0)
+    weight = vertical.sum(axis=1)
+    moments = vertical @ feet
+    if directions > 3:
+        # A sole carries moments about its point, too.
+        about_x, about_y, _ = contact_forces[:, :, 1].sum(axis=1).T
+        moments += np.stack([-about_y, about_x], axis=1)
+    along = np.hypot(along_x.sum(axis=1), along_y.sum(axis=1))
+    return GroundForces(moments / weight[:, None], along / weight, forces - carried)
 
 
 def distance_inside(points: np.ndarray, feet: np.ndarray) -> np.ndarray:

@@ -12,6 +12,12 @@ import numpy as np
 from jaxid.arrays import BaseMatrix, BaseVector, Indices, Matrix, Texts, Vector
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
+from jaxid.dynamics.open_directions import (
+    OPEN_SHARES,
+    UndeterminedDirection,
+    random_rows,
+    status_of,
+)
 from jaxid.errors import InputError
 from jaxid.io import (
     import_extra,
@@ -32,12 +38,6 @@ from jaxid.result_table import (
 )
 
 from .consistency.estimator import Consistency
-from .determination import (
-    OPEN_SHARES,
-    UndeterminedDirection,
-    random_rows,
-    status_of,
-)
 from .estimators.estimate import AbstractEstimator, EstimatorInWords
 from .estimators.regularisation_and_weights import (
     AbstractSpectralSolution,

@@ -9,10 +9,11 @@ import numpy as np
 
 from jaxid.arrays import AnyArray, BaseMatrix, BaseVector, Matrix, Texts
 from jaxid.dynamics.base import BaseParameters
+from jaxid.dynamics.open_directions import random_rows
 from jaxid.errors import InputError
 from jaxid.measurement.observations import Observations, ObservedLogs, Progress
 
-from .determination import random_rows, undetermined
+from .determination import undetermined
 from .estimators.estimate import AbstractEstimator
 from .estimators.least_squares import WeightedLeastSquares
 from .estimators.regularisation_and_weights import (

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxid.arrays import double_precision
+from jaxid.dynamics.open_directions import status_of
 from jaxid.excitation.design_result import ExcitationPlan
 from jaxid.io import write_text
 from jaxid.result_table import Remark, Status, significant, sort_remarks
@@ -136,7 +137,8 @@ def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
     """Return the verdict on a motion in one sentence; `remarks` has one per check."""
     status = Status.BAD
     unchecked_names = [remark.unchecked for remark in remarks if remark.unchecked]
-    if plan.undetermined:
+    openness = status_of(plan.open_share)
+    if openness is Status.BAD:
         text = "This motion does not determine all base parameters."
     elif not plan.feasible:
         text = "This motion does not keep all limits."
@@ -146,6 +148,14 @@ def motion_verdict(plan: ExcitationPlan, remarks: Sequence[Remark]) -> Remark:
         status = Status.DOUBTFUL
         names = ", ".join(unchecked_names)
         text = f"This motion keeps all limits that were checked; not checked: {names}."
+    elif openness is Status.DOUBTFUL:
+        status = openness
+        count = len(plan.undetermined)
+        text = (
+            "This motion keeps all limits, but one run leaves "
+            f"{count} of {plan.base.size} combinations of parameters open: record it "
+            "several times."
+        )
     elif plan.mean_gain < 1.0:
         status = Status.DOUBTFUL
         text = (

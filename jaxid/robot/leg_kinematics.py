@@ -147,6 +147,25 @@ def place_feet(legs: Sequence[Leg], q: np.ndarray, places: FootPlaces) -> np.nda
     return q
 
 
+def pose_joints(robot: Robot, angles: Mapping[str, float] | None) -> dict[int, float]:
+    """Return the angles of the joints whose names contain a word.
+
+    Raises:
+        InputError: If a word fits no joint.
+    """
+    joints: dict[int, float] = {}
+    for word, angle in (angles or {}).items():
+        fitting = [j for j in robot.driven if word in robot.joint_names[j]]
+        if not fitting:
+            names = ", ".join(robot.joint_names[j] for j in robot.driven)
+            raise InputError(
+                f"`pose` must name joints, or parts of their names, but no joint "
+                f"({names}) contains `{word}`."
+            )
+        joints |= dict.fromkeys(fitting, angle)
+    return joints
+
+
 def standing_pose(
     robot: Robot, legs: Sequence[Leg], angles: Mapping[str, float] | None = None
 ) -> np.ndarray:
@@ -157,8 +176,8 @@ def standing_pose(
         legs: Its legs.
         angles: Angles of the joints whose names contain a word, like `{"knee": 0.9}`;
             all others are zero, or in the middle of a range that ends near zero. If
-            None, the feet are where they are at zero angles, and the trunk is lowered
-            with bent knees.
+            they are of no leg, the feet are where they are at zero angles, and the
+            trunk is lowered with bent knees.
 
     Raises:
         InputError: If a word fits no joint, the feet are not on one plane, or no pose
@@ -169,28 +188,24 @@ def standing_pose(
     high = np.asarray(limits.position_max)
     is_near_end = np.minimum(-low, high) < INNER_ROOM
     q = np.where(is_near_end, 0.5 * (low + high), 0.0)
-    if angles is None:
-        return _bent_pose(robot, legs, q)
-    for word, angle in angles.items():
-        joints = [j for j in robot.driven if word in robot.joint_names[j]]
-        if not joints:
-            names = ", ".join(robot.joint_names[j] for j in robot.driven)
-            raise InputError(
-                f"`pose` must name joints, or parts of their names, but no joint "
-                f"({names}) contains `{word}`."
-            )
-        q[joints] = angle
-    heights = foot_places(legs, q[None]).positions[0, :, 2]
+    joints = pose_joints(robot, angles)
+    q[list(joints)] = list(joints.values())
+    if not any(joint in joints for leg in legs for joint in leg.joints):
+        q = _bent_pose(robot, legs, q)
+    positions = foot_places(legs, q[None]).positions[0]
+    radii = [getattr(c.shape, "radius", 0.0) for c in robot.contacts]
+    heights = positions[:, 2] - radii
     if np.ptp(heights) > LEVEL_TOLERANCE:
         raise InputError(
             f"`pose` must put all feet on one plane below a level trunk, but their "
             f"heights differ by {np.ptp(heights):.3g} m."
         )
-    return _raised(legs, q)
+    q[2] -= heights.mean()
+    return q
 
 
 def _bent_pose(robot: Robot, legs: Sequence[Leg], q: np.ndarray) -> np.ndarray:
-    """Return a pose with the feet below where they are at zero angles."""
+    """Return a pose with bent knees, the feet below where they are at zero angles."""
     places = foot_places(legs, np.zeros((1, robot.joints)))
     for number, leg in enumerate(legs):
         tip = tip_jacobian(leg.foot, np.zeros((1, robot.joints)))
@@ -209,13 +224,4 @@ def _bent_pose(robot: Robot, legs: Sequence[Leg], q: np.ndarray) -> np.ndarray:
             f"no standing pose of `{robot.name}` was found: give the angles of its "
             "joints as `pose`."
         )
-    return _raised(legs, pose)
-
-
-def _raised(legs: Sequence[Leg], q: np.ndarray) -> np.ndarray:
-    """Return a pose with the trunk so high that the lowest feet touch the ground."""
-    radii = [getattr(c.shape, "radius", 0.0) for c in legs[0].foot.contacts]
-    heights = foot_places(legs, q[None]).positions[0, :, 2] - radii
-    raised = q.copy()
-    raised[2] = -heights.mean()
-    return raised
+    return pose

@@ -93,8 +93,8 @@ def write_csv(
     """Write a table of times, positions, velocities and accelerations.
 
     The header names joint and unit: `time [s],q_joint1 [rad],...,qdd_joint1
-    [rad/s^2],...`. Of a robot on its feet, `contact_FOOT` is 1 where the foot is to
-    stand.
+    [rad/s^2],...`. Of a robot on its feet, `tau_JOINT` is the force by nominal
+    parameters, and `contact_FOOT` is 1 where the foot is to stand.
 
     Args:
         trajectory: Trajectory, sampled from its start to its end.
@@ -113,6 +113,10 @@ def write_csv(
         for j, name in enumerate(robot.joint_names):
             unit = f"{robot.joint_unit(j)}{rate}"
             columns[f"{symbol}_{name} [{unit}]"] = values[:, j]
+    forces = trajectory.feed_forward(times)
+    if forces is not None:
+        for j, name in enumerate(robot.joint_names):
+            columns[f"tau_{name} [{robot.force_unit(j)}]"] = forces[:, j]
     columns |= trajectory.columns(times)
     write_text(path, pl.DataFrame(columns).write_csv())
 
@@ -132,13 +136,15 @@ def write_ros(
     `write_csv`, and so are the errors.
     """
     times, motion = _sample(trajectory, robot, sample_time)
+    forces = trajectory.feed_forward(times)
+    efforts = [[]] * len(times) if forces is None else forces.tolist()
     points = []
     for k, time in enumerate(times.tolist()):
         point = {
             "positions": motion.q[k].tolist(),
             "velocities": motion.qd[k].tolist(),
             "accelerations": motion.qdd[k].tolist(),
-            "effort": [],
+            "effort": efforts[k],
             "time_from_start": _ros_time(time),
         }
         points.append(point)

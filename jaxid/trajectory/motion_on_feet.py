@@ -18,12 +18,15 @@ class MotionOnFeet(AbstractTrajectory):
         feet: Names of the feet.
         lifts: Times between which each foot is in the air [s].
         coefficients: Numbers from which the motion was made, for each phase.
+        forces: Forces of the driven joints by nominal parameters at equidistant times
+            from begin to end [N m or N].
     """
 
     path: PiecewisePolynomial
     feet: tuple[str, ...] = eqx.field(static=True)
     lifts: Float[AnyArray, "feet 2"]
     coefficients: Float[AnyArray, "phases coordinates variables"]
+    forces: Float[AnyArray, "times joints"]
 
     @property
     def duration(self):
@@ -45,3 +48,9 @@ class MotionOnFeet(AbstractTrajectory):
         flags = self.stands(t).T.astype(float)
         names = [f"contact_{foot}" for foot in self.feet]
         return dict(zip(names, flags, strict=True))
+
+    def feed_forward(self, t):
+        """Return the forces of the driven joints by nominal parameters [N m or N]."""
+        times = np.linspace(0.0, float(self.duration), len(self.forces))
+        columns = [np.interp(t, times, column) for column in np.transpose(self.forces)]
+        return np.transpose(columns)

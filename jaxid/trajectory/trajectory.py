@@ -70,6 +70,10 @@ class AbstractTrajectory(Hashable):
         """Return what a table says beside the motion, by name, at times [s]."""
         return {}
 
+    def feed_forward(self, t: AnyArray) -> AnyArray | None:
+        """Return forces that a controller may add, at times [s]; None if unknown."""
+        return None
+
     @property
     def joints(self) -> int:
         """Number of joints."""
@@ -127,6 +131,10 @@ class PaddedToCycle(AbstractTrajectory):
     def columns(self, t):
         """Return the columns of the motion."""
         return self.inner.columns(t)
+
+    def feed_forward(self, t):
+        """Return the forces of the motion."""
+        return self.inner.feed_forward(t)
 
 
 def count_cycles(duration: float, sample_time: float) -> int:

@@ -8,6 +8,7 @@ import numpy as np
 
 from jaxid.errors import InputError
 from jaxid.excitation.criteria import CRITERIA, AbstractCriterion
+from jaxid.robot.robot import Robot
 from jaxid.trajectory.controllers import CONTROLLERS
 from jaxid.trajectory.fourier import FourierBasis, RestToRestBasis
 from jaxid.trajectory.lead_in_and_out import LeadsBasis
@@ -19,6 +20,10 @@ HARMONICS = 5
 """Number of harmonics of the series of an arm."""
 HARMONICS_ON_FEET = 20
 """The same of a robot on its feet: each phase is one period."""
+SAMPLES = 800
+"""Number of samples of one run of an arm."""
+STEP_ON_FEET = 0.005
+"""Time between two samples of a robot on its feet [s]."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -51,7 +56,8 @@ class Excitation:
             and back; or a table, like `{ time = 0.5, periods = 2 }`: their duration
             (they are then designed together with the motion) and the number of periods
             between them.
-        samples: Number of samples that one run will measure.
+        samples: Number of samples that one run will measure; by default 800, and 200
+            for each second of a robot on its feet.
         noise: Standard deviation of the forces' noise for each joint [N m or N]; by
             default 1 % of the largest forces.
         starts: Number of random motions to start from.
@@ -88,7 +94,7 @@ class Excitation:
     rest: bool = False
     spline: RestToRestSplineBasis | None = None
     leads: bool | Leads = True
-    samples: int = 800
+    samples: int | None = None
     noise: list[float] | None = None
     starts: int = 32
     generations: int = 12
@@ -130,6 +136,15 @@ class Excitation:
     def rests(self) -> bool:
         """Whether the motion starts and ends at standstill, if leads are possible."""
         return self.chosen_leads is not None or self.rest or self.spline is not None
+
+    def count_samples(self, robot: Robot) -> int:
+        """Return the number of samples that one run will measure."""
+        if self.samples is not None:
+            return self.samples
+        if not robot.floating:
+            return SAMPLES
+        phases = 1 + len(robot.contacts)
+        return round(phases * 2 * np.pi / self.omega / STEP_ON_FEET)
 
     def basis(self, has_constraints: bool) -> AbstractBasis:
         """Return the basis of trajectories; if constrained, leads are designed, too.

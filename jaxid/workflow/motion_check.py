@@ -5,14 +5,19 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 
 from jaxid.excitation.constraints import Finding, LoopLimits
-from jaxid.excitation.design_result import ExcitationPlan
+from jaxid.excitation.design_result import USUAL_NOISE, ExcitationPlan
 from jaxid.result_table import Remark, Status
-from jaxid.robot.robot import Robot
+from jaxid.robot.contacts import Sole
 from jaxid.robot.shapes import HalfSpace
+from jaxid.robot.virtual_joints import GROUP
 from jaxid.trajectory.motion_on_feet import MotionOnFeet
 
 from .surroundings import Surroundings
 
+GAIN_OVER_MOMENT = 2.0
+"""Gain of a controller that also adds forces, over weight times height [1/rad]."""
+GAIN_OVER_TORQUE = 20.0
+"""Gain of one that does not, over the largest torque [1/rad]."""
 MAX_ROUNDING = 1e-6
 """Excess over a limit of the joints that counts as rounding, relative to the limit."""
 
@@ -70,13 +75,14 @@ def check_joints(plan: ExcitationPlan) -> Remark:
     )
 
 
-def describe_standing(robot: Robot, motion: MotionOnFeet) -> Iterator[Remark]:
+def describe_standing(plan: ExcitationPlan, motion: MotionOnFeet) -> Iterator[Remark]:
     """Yield the standing pose, the phases, and what is not known of standing.
 
     Args:
-        robot: Robot of the driven joints.
+        plan: Design of a robot on its feet.
         motion: Its motion.
     """
+    robot = plan.robot
     pose = np.asarray(motion.motion(np.zeros(1)).q)[0]
     angles = ", ".join(
         f"{name} {angle:.3f}"
@@ -90,11 +96,18 @@ def describe_standing(robot: Robot, motion: MotionOnFeet) -> Iterator[Remark]:
     yield Remark(
         f"feet in the air: {lifts}; columns `contact_…` of the table are 0 then"
     )
+    # The noise of a moment on the trunk is a share of weight times height.
+    gain = GAIN_OVER_MOMENT * float(plan.noise[GROUP - 1]) / USUAL_NOISE
+    stiff_gain = GAIN_OVER_TORQUE * float(np.abs(motion.forces).max())
+    alternative = f"they need gains of {stiff_gain:.0f} N m/rad"
+    if any(isinstance(x.shape, Sole) for x in plan.base.model.robot.contacts):
+        alternative = "a robot on soles falls"
     yield Remark(
         "standing on the feet: not checked are ground that is not level, and legs that "
-        "give way under the weight: give controllers gains of 20 rad⁻¹ times the "
-        "largest torque, or a larger `support_margin`, and secure the robot against a "
-        "fall",
+        "give way under the weight: let controllers add the forces `tau_…` of the "
+        "table, which rest on the nominal parameters, to gains of at least "
+        f"{gain:.0f} N m/rad (twice the weight times the height of the trunk); without "
+        f"these forces {alternative}; and secure the robot against a fall",
         Status.DOUBTFUL,
     )
 

@@ -41,7 +41,7 @@ from jaxid.trajectory.trajectory import (
     PaddedToCycle,
 )
 
-from .excitation_settings import HARMONICS_ON_FEET, Excitation
+from .excitation_settings import HARMONICS_ON_FEET, STEP_ON_FEET, Excitation
 from .motion_check import check_motion, describe_standing
 from .nominal_parameters import (
     UNKNOWN_SHARE,
@@ -56,10 +56,6 @@ from .surroundings import Surroundings, compared_on_feet
 
 Improvement = Callable[[LinearTrajectory | MotionOnFeet], None]
 """Callback, called with every better motion that keeps all limits."""
-
-
-STEP_ON_FEET = 0.005
-"""Time between two rows of the table of a robot on its feet, if none is given [s]."""
 
 
 class MotionTask(NamedTuple):
@@ -265,7 +261,7 @@ def design_motion(
         constraints=task.constraints,
         key=jax.random.key(excitation.seed),
         noise=noise,
-        samples=excitation.samples,
+        samples=excitation.count_samples(setup.robot),
         criterion=excitation.objective,
         starts=excitation.starts,
         generations=excitation.generations,
@@ -302,7 +298,7 @@ def make_playable(
 ) -> PlayableMotion:
     """Return a motion from standstill to standstill, in samples of the controller."""
     leads = excitation.chosen_leads
-    times = np.asarray(motion.measured_times(excitation.samples))
+    times = np.asarray(motion.measured_times(excitation.count_samples(robot)))
     step = float(times[1] - times[0])
     begin = float(times[0])
     end = float(times[-1]) + step
@@ -423,7 +419,7 @@ def describe_motion(
         )
     leads = excitation.chosen_leads
     if isinstance(plan.trajectory, MotionOnFeet):
-        yield from describe_standing(plan.robot, plan.trajectory)
+        yield from describe_standing(plan, plan.trajectory)
     elif leads is not None and leads.periods > 1:
         yield Remark(
             f"the motion runs through {leads.periods} periods; the deviations are for "

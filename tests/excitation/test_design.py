@@ -82,7 +82,8 @@ def test_the_mean_gain_leaves_out_what_stays_open(plan):
     blind = dataclasses.replace(
         plan, information=dataclasses.replace(plan.information, weighted=weighted)
     )
-    assert blind.undetermined == plan.base.names[:1]
+    assert [x.parts for x in blind.undetermined] == [(0,)]
+    assert blind.open_share == np.inf
     assert blind.gains[0] == 0.0
     np.testing.assert_allclose(
         blind.mean_gain, np.exp(np.mean(np.log(blind.gains[1:])))

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import polars as pl
 import pytest
+import yaml
 
 import jaxid as jid
 from jaxid.excitation.checks_on_feet import ChecksOnFeet
@@ -45,28 +46,20 @@ pytestmark = pytest.mark.skipif(
 )
 
 
-def free_flyer(path):
+def on_ground(path):
+    """Pinocchio's robot, whose trunk slides along and then turns about x, y, z."""
     text = re.sub(r"(?s)<(visual|collision)\b.*?</\1>", "", path.read_text())
-    model = pin.buildModelFromXML(text, pin.JointModelFreeFlyer())
+    root = pin.JointModelComposite()
+    for joint in (pin.JointModelTranslation, pin.JointModelRX, pin.JointModelRY):
+        root.addJoint(joint())
+    root.addJoint(pin.JointModelRZ())
+    model = pin.buildModelFromXML(text, root)
     return model, model.createData()
 
 
-def pin_states(model, robot, motion):
-    """The states of Pinocchio's free-flyer: attitude, and rates along the trunk."""
+def joint_order(model, robot):
     names = [*model.names][2:]
-    order = [robot.joint_names.index(name) for name in names]
-    trunk = measured_motion(robot, motion)
-    gravity = np.array([0.0, 0.0, -9.81])
-    velocities = np.asarray(motion.qd)
-    for k in range(len(motion.q)):
-        R = trunk.rotation[k]
-        q = np.r_[motion.q[k, :3], pin.Quaternion(R).coeffs(), motion.q[k, order]]
-        w = np.asarray(trunk.motion.qd)[k, 3:6]
-        v = np.r_[R.T @ velocities[k, :3], w, velocities[k, order]]
-        # The spatial acceleration of Pinocchio is that of the moving point.
-        linear = R.T @ (np.asarray(motion.qdd)[k, :3]) - np.cross(w, v[:3])
-        assert np.allclose(trunk.motion.qdd[k, :3], R.T @ (motion.qdd[k, :3] - gravity))
-        yield q, v, linear, order
+    return [*range(6), *(robot.joint_names.index(name) for name in names)]
 
 
 @pytest.fixture(scope="module")
@@ -99,25 +92,22 @@ def test_forces_and_balance_are_those_of_pinocchio(task, motions):
     robot = motions.robot
     base = task.setup.base
     random = np.random.default_rng(3)
-    phase = motions.phase(2, motions.random(2, random))
+    phase = motions.phase(2, motions.random(random))
     times = np.linspace(0.0, motions.duration, 9)
     motion = phase.motion(times)
-    stands = phase.stands(times, 4)
-    trunk = measured_motion(robot, motion)
+    loads = motions.loads(2, times)
     parameters = motions.standing.parameters
-    forces = ground_forces(base, parameters, trunk, stands)
-    model, data = free_flyer(GO2)
+    trunk = measured_motion(robot, motion)
+    forces = ground_forces(base, parameters, trunk, loads, motions.feet)
+    model, data = on_ground(GO2)
+    order = joint_order(model, robot)
     feet = [model.getFrameId(foot) for foot in FEET]
-    for k, (q, v, linear, order) in enumerate(pin_states(model, robot, motion)):
-        turning = np.asarray(trunk.motion.qdd)[k, 3:6]
-        w = v[3:6]
-        turning = turning + np.array([w[1] * w[2], -w[0] * w[2], w[0] * w[1]])
-        a = np.r_[linear, turning, np.asarray(motion.qdd)[k, order]]
-        torques = pin.rnea(model, data, q, v, a)
-        left = torques.copy()
-        left[6:] -= forces.joint_forces[k, order]
+    q, qd, qdd = (np.asarray(x)[:, order] for x in (motion.q, motion.qd, motion.qdd))
+    for k in range(len(times)):
+        left = pin.rnea(model, data, q[k], qd[k], qdd[k])
+        left[6:] -= forces.joint_forces[k, order[6:]]
         # What the torques leave is the work of forces on the feet that stand.
-        pin.computeJointJacobians(model, data, q)
+        pin.computeJointJacobians(model, data, q[k])
         pin.updateFramePlacements(model, data)
         total, moment = np.zeros((2, 3))
         for foot, frame in enumerate(feet):
@@ -126,7 +116,7 @@ def test_forces_and_balance_are_those_of_pinocchio(task, motions):
             linear_part = J[:3] - pin.skew(arm) @ J[3:]
             leg = np.flatnonzero(np.abs(J[:, 6:]).max(axis=0) > 0) + 6
             force = np.linalg.solve(linear_part[:, leg].T, left[leg])
-            if not stands[k, foot]:
+            if loads[k, foot] == 0.0:
                 assert np.abs(force).max() < 1e-6
             total += force
             place = data.oMf[frame].translation + arm
@@ -150,15 +140,35 @@ def test_feet_stay_where_they_are_under_a_trunk_that_moves(path, feet, size):
     q = np.tile(pose, (5, 1))
     q[:, :6] += np.random.default_rng(0).normal(scale=size, size=(5, 6))
     q = place_feet(legs, q, FootPlaces(*(np.repeat(x, 5, axis=0) for x in home)))
-    zero = np.zeros_like(q)
-    model, data = free_flyer(path)
-    for state, *_ in pin_states(model, robot, jid.Motion(q, zero, zero)):
-        pin.framesForwardKinematics(model, data, state)
+    model, data = on_ground(path)
+    for coordinates in q[:, joint_order(model, robot)]:
+        pin.framesForwardKinematics(model, data, coordinates)
         for foot, name in enumerate(feet):
             place = data.oMf[model.getFrameId(name)]
             assert np.allclose(place.translation, home.positions[0, foot], atol=1e-7)
             if feet is SOLES:
                 assert np.allclose(place.rotation, home.rotations[0, foot], atol=1e-7)
+
+
+def test_the_zero_moment_point_follows_its_path(task):
+    """The check is that of the forces, between the instants of the search, too."""
+    motions = MotionsOnFeet(task.setup.base, task.family["standing"], 20, 0.8)
+    random = np.random.default_rng(1)
+    times = np.linspace(0.0, motions.duration, 1001)
+    for number in (0, 3):
+        waves = 0.5 * motions.random(random)
+        phase = motions.phase(number, waves)
+        loads = motions.loads(number, times)
+        forces = motions.forces(phase.motion(times), loads)
+        path = motions._path(motions.loads(number, motions.times))
+        shares = (motions.rows @ waves.T)[:, :2]
+        path = path + motions._largest(number)[:2] * shares
+        for axis in range(2):
+            planned = np.interp(times, motions.times, path[:, axis])
+            assert np.abs(forces.zero_moment_point[:, axis] - planned).max() < 0.005
+        # The load moves smoothly: torques of a lifted leg do not jump.
+        steps = np.abs(np.diff(forces.joint_forces, axis=0)).max()
+        assert steps < 0.1 * np.abs(forces.joint_forces).max()
 
 
 def test_points_inside_the_polygon_of_the_feet():
@@ -189,7 +199,6 @@ def test_a_designed_motion_starts_and_ends_at_rest_and_keeps_its_limits(designed
         assert np.abs(change - 0.5 * (rate[1:] + rate[:-1])).max() < 0.02
     assert plan.feasible
     assert plan.use.max() <= 1.0
-    assert not plan.undetermined
     limits = plan.robot.limits
     assert (np.asarray(samples.q) <= limits.position_max).all()
     assert (np.asarray(samples.q) >= limits.position_min).all()
@@ -208,6 +217,11 @@ def test_files_say_which_feet_stand(task, designed, tmp_path):
     table = pl.read_csv(tmp_path / "motion.csv")
     flags = table.select(pl.selectors.starts_with("contact_")).to_numpy()
     assert table.columns[-4:] == [f"contact_{foot}" for foot in FEET]
+    forces = table.select(pl.selectors.starts_with("tau_")).to_numpy()
+    times = table["time [s]"].to_numpy()
+    assert np.allclose(forces, designed.plan.trajectory.feed_forward(times), atol=1e-6)
+    message = yaml.safe_load((tmp_path / "motion.ros.yaml").read_text())
+    assert np.allclose(message["points"][7]["effort"], forces[7], atol=1e-6)
     assert (flags.sum(axis=1) >= 3).all()
     assert (flags.min(axis=0) == 0).all()
     motion = load_trajectory(tmp_path / "motion.json")
@@ -224,7 +238,11 @@ def test_ctrl_c_keeps_the_best_motion_and_begin_goes_on(task, designed):
     settings = {**task.family, "constraints": task.constraints}
     motion = designed.plan.trajectory
     plan = jid.design_excitation(
-        task.setup.base, **settings, begin=motion, progress=stop
+        task.setup.base,
+        **settings,
+        begin=motion,
+        progress=stop,
+        samples=designed.plan.samples,
     )
     assert plan.status is DesignStatus.STOPPED
     assert np.allclose(plan.trajectory.coefficients, motion.coefficients)
@@ -253,6 +271,7 @@ def test_it_does_not_fall_in_mujoco(designed):
     times = np.arange(0.0, float(motion.duration), 0.002)
     samples = motion.motion(times)
     q, qd = np.asarray(samples.q)[:, order], np.asarray(samples.qd)[:, order]
+    forces = motion.feed_forward(times)[:, order]
     stands = motion.stands(times)
     data.qpos[7:] = q[0]
     mujoco.mj_kinematics(model, data)
@@ -260,8 +279,9 @@ def test_it_does_not_fall_in_mujoco(designed):
     data.qpos[2] -= data.geom_xpos[feet, 2].min() - 0.022
     heights = []
     for k in range(len(times)):
-        torques = 120.0 * (q[k] - data.qpos[7:]) + 2.5 * (qd[k] - data.qvel[6:])
-        data.qfrc_applied[6:] = np.clip(torques, -40.0, 40.0)
+        # With so soft controllers it falls without the forces.
+        torques = 60.0 * (q[k] - data.qpos[7:]) + 2.0 * (qd[k] - data.qvel[6:])
+        data.qfrc_applied[6:] = np.clip(torques + forces[k], -40.0, 40.0)
         mujoco.mj_step(model, data)
         assert data.xmat[1].reshape(3, 3)[2, 2] > 0.9, times[k]
         heights.append(data.geom_xpos[feet, 2] - 0.022)
@@ -296,8 +316,8 @@ def test_what_cannot_work_is_refused(task, monkeypatch):
         with pytest.raises(jid.InputError, match=words):
             standing_pose(robot, legs, pose)
     straight = standing._replace(pose={"thigh": 0.0, "calf": 0.0})
-    with pytest.raises(jid.InputError, match="lean so far"):
-        MotionsOnFeet(base, straight, 4, 1.5)
+    with pytest.raises(jid.InputError, match="knees bent more"):
+        jid.design_excitation(base, standing=straight)
     heavy = standing._replace(parameters=20.0 * np.asarray(standing.parameters))
     with pytest.raises(jid.InputError, match="the force of joint"):
         jid.design_excitation(base, standing=heavy)
@@ -314,17 +334,13 @@ def test_a_pose_of_the_user_is_where_the_motion_begins(task):
 
 
 def test_a_slippery_ground_makes_motions_smaller(motions):
-    phase = motions.phase(0, motions.random(0, np.random.default_rng(0)))
-    motion = phase.motion(motions.times)
-    stands = phase.stands(motions.times, 4)
+    phase = motions.phase(0, motions.random(np.random.default_rng(0)))
+    loads = motions.loads(0, motions.times)
+    forces = motions.forces(phase.motion(motions.times), loads)
 
     def friction(coefficient):
         motions.standing = motions.standing._replace(friction=coefficient)
-        limits = motions.robot.limits
-        joints = jid.Limits(12, position_min=limits.position_min[6:])
-        checks = ChecksOnFeet(motions, joints, ())
-        _, finding, *_ = checks._falling(motion, stands)
-        return finding
+        return ChecksOnFeet(motions, motions.robot.limits, ())._friction(forces)
 
     assert friction(0.5).reached == pytest.approx(friction(0.1).reached)
     assert friction(0.1).value > friction(0.5).value
