@@ -22,6 +22,7 @@ from floating import (
     COLUMNS,
     G1,
     GO2,
+    NOISE,
     ROBOTS,
     SAMPLE_TIME,
     Legged,
@@ -50,6 +51,7 @@ SETTLING_TIME = (
 
 def design(robot: Legged, seconds: float) -> Any:
     """Return the motion that the command designs with an experiment file."""
+    joints = len(robot.load().driven)
     quoted_sole = '"sole"'
     contacts = [
         f"{foot} = {getattr(shape, 'radius', quoted_sole)}"
@@ -58,6 +60,7 @@ def design(robot: Legged, seconds: float) -> Any:
     text = (
         f'[robot]\nurdf = "{ROBOTS / robot.path}"\nfloating = true\n'
         f"contacts = {{ {', '.join(contacts)} }}\n"
+        f"[excitation]\nnoise = {[NOISE['forces']] * joints}\n"
     )
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "experiment.toml"

@@ -135,7 +135,7 @@ class ChecksOnFeet(NamedTuple):
         heights = []
         for leg in self.motions.legs:
             upper_joints = leg.joints[: (len(leg.joints) + 3) // 2]
-            tip = tip_jacobian(leg.foot, motion.q)
+            tip = tip_jacobian(leg.foot, np.asarray(motion.q))
             heights.append(tip.origins[:, upper_joints, 2].min())
         return Finding(
             "the height of the legs' joints above the ground",

@@ -223,7 +223,7 @@ class ExcitationPlan(Summarised, eqx.Module):
 
     @property
     def determination(self) -> list[Remark]:
-        """What one run leaves open by the rule of `jaxid identify`, and the cure."""
+        """Combinations that one run leaves open, by the rule of `jaxid identify`."""
         count = len(self.undetermined)
         if not count:
             return []

@@ -266,7 +266,7 @@ class MotionsOnFeet:
         height = self.pose[2]
         feet = self.feet[self.loads(number, self.times).min(axis=0) > 0.0]
         room = self._room(feet.mean(axis=0, keepdims=True), feet)
-        trunk = self.sizes.trunk * np.array([height, 1.0, 1.0, 1.0])
+        trunk = np.array(self.sizes.trunk) * [height, 1.0, 1.0, 1.0]
         sizes = [
             np.tile(self.sizes.path * room, 2),
             self.sizes.trunk_on_fewer_feet * trunk if number else trunk,

@@ -11,6 +11,7 @@ from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 from jaxid.arrays import AnyArray, Vector
 from jaxid.identification.fit_result import Fit
 from jaxid.io import FilePath, import_extra, write_text
+from jaxid.robot.contacts import Contact, Sphere
 from jaxid.robot.follower_joints import Follower
 from jaxid.robot.inertia import BodyParameters, Inertia
 from jaxid.robot.joint_coordinates import with_leader
@@ -25,12 +26,19 @@ from .bodies_and_joint_dynamics import (
     origin_comment,
 )
 
+POINT_RADIUS = 0.005
+"""Radius of a foot that is a point [m]."""
+SOLE_SIZE = (0.03, 0.005)
+"""Radius and half the thickness of a sole, whose shape the robot does not hold [m]."""
 ATTRIBUTES = {"armature": "armature", "damping": "damping", "friction": "frictionloss"}
 """Attributes of MJCF for the quantities of `joint_dynamics`."""
 
 
 def export_mjcf(fit: Fit, path: FilePath) -> Path:
     """Write the model for MuJoCo: geometry, bodies, rotors, friction, limits, motors.
+
+    Feet of a robot on legs touch the ground: balls as they are, and of a sole the
+    circle that a designed motion counts on. No other body has a shape.
 
     Rotor inertias are `armature`, viscous friction is `damping`, dry friction is
     `frictionloss` (without the width of a tanh: MuJoCo's own dry friction holds a joint
@@ -110,6 +118,8 @@ def mjcf_text(
         )
         elements[robot.parent[i]].append(body)
         elements[i] = body
+    for contact in robot.contacts:
+        elements[contact.body].append(_foot(contact))
     actuators.extend(_motor(robot, joint) for joint in robot.driven)
     if robot.followers:
         led_followers = with_leader(robot.followers)
@@ -119,6 +129,17 @@ def mjcf_text(
     tip = placement_attributes(robot.tip_offset, robot.tip_rotation)
     elements[robot.tip_body].append(E.site(name="tip", **tip))
     return etree.tostring(root, pretty_print=True, encoding="unicode")
+
+
+def _foot(contact: Contact) -> Any:
+    """Return the shape of a foot, without mass."""
+    kind = "cylinder"
+    size = SOLE_SIZE
+    if isinstance(contact.shape, Sphere):
+        kind = "sphere"
+        size = (contact.shape.radius or POINT_RADIUS,)
+    place = exact_text(contact.position)
+    return E.geom(name=contact.name, type=kind, size=exact_text(size), pos=place)
 
 
 def _inertial(p: Vector) -> Any:

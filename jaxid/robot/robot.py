@@ -63,8 +63,7 @@ class Robot(Summarised, Hashable):
         parent: Indices of the parent bodies, -1 for the ground; a serial chain if None.
         followers: Joints that follow others, or that loops move; these come last.
         loops: Pairs of points that coincide; `with_loops` gives them to a robot.
-        loop_rows: Entries of the distances between these points that close the loops,
-            as many as joints that loops move.
+        loop_rows: Entries of the distances between these points that close the loops.
         loop_pose: Coordinates of all joints at which the description closes the loops.
         coordinates: Those at the sample for which it is evaluated (`at_sample`).
         joint_names: Names of the joints; `joint1`, `joint2`, … if None.
@@ -456,10 +455,10 @@ class Robot(Summarised, Hashable):
 
     def unit_columns(self) -> tuple[str, str, list[Column]]:
         """Return the units of coordinates and forces; if they differ, as columns."""
-        units = [self.joint_unit(j) for j in range(self.joints)]
+        units = [self.joint_unit(j) for j in self.driven]
+        force_units = [self.force_unit(j) for j in self.driven]
         if len(set(units)) == 1:
-            return units[0], self.force_unit(0), []
-        force_units = [self.force_unit(j) for j in range(self.joints)]
+            return units[0], force_units[0], []
         columns = [Column("unit", units), Column("force unit", force_units)]
         return "unit", "force unit", columns
 
@@ -473,28 +472,29 @@ class Robot(Summarised, Hashable):
         return remarks
 
     def summary(self) -> Table:
-        """Return a table of the joints: parents, ranges, speeds and largest forces."""
+        """Return a table of the driven joints: parents, ranges, speeds and forces."""
         names = ("ground", *self.body_names)
         unit, force_unit, units = self.unit_columns()
-        limits = self.limits
-        tip_carrier = self.body_names[self.tip_body]
-        facts = [("end-effector", f"on the body of `{tip_carrier}`")]
+        joints = list(self.driven)
+        facts = [("end-effector", f"on the body of `{names[self.tip_body + 1]}`")]
+        if self.floating:
+            facts = [("feet", ", ".join(contact.name for contact in self.contacts))]
         if self.tool is not None:
-            carrier = self.body_names[self.tool.body]
-            mass = float(self.tool.mass)
-            facts.append(("tool", f"{mass:.3g} kg on the body of `{carrier}`"))
+            carrier = names[self.tool.body + 1]
+            text = f"{float(self.tool.mass):.3g} kg on the body of `{carrier}`"
+            facts.append(("tool", text))
         if self.source:
             facts.append(("source", self.source))
         return Table(
             f"{self.name}: {len(self.driven)} joints",
-            Column("joint", self.joint_names),
-            Column("parent", [names[p + 1] for p in self.parent[: self.joints]]),
+            Column("joint", [self.joint_names[j] for j in joints]),
+            Column("parent", [names[self.parent[j] + 1] for j in joints]),
             *units,
-            Column("from", np.asarray(limits.position_min), unit),
-            Column("to", np.asarray(limits.position_max), unit),
-            Column("speed", np.asarray(limits.velocity), f"{unit}/s"),
-            Column("acceleration", np.asarray(limits.acceleration), f"{unit}/s²"),
-            Column("force", self.known_max_forces, force_unit),
+            Column("from", self.limits.position_min[joints], unit),
+            Column("to", self.limits.position_max[joints], unit),
+            Column("speed", self.limits.velocity[joints], f"{unit}/s"),
+            Column("acceleration", self.limits.acceleration[joints], f"{unit}/s²"),
+            Column("force", self.known_max_forces[joints], force_unit),
             facts=facts,
             remarks=self.remarks,
         )

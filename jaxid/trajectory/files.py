@@ -116,7 +116,7 @@ def write_csv(
     forces = trajectory.feed_forward(times)
     if forces is not None:
         for j, name in enumerate(robot.joint_names):
-            columns[f"tau_{name} [{robot.force_unit(j)}]"] = forces[:, j]
+            columns[f"tau_{name} [{robot.force_unit(j)}]"] = np.asarray(forces)[:, j]
     columns |= trajectory.columns(times)
     write_text(path, pl.DataFrame(columns).write_csv())
 

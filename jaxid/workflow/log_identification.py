@@ -22,7 +22,7 @@ from jaxid.measurement.observations import Observations
 from jaxid.measurement.recording import Recording
 from jaxid.report.identification_page import body_table, motor_tables
 from jaxid.report.result_files import write_report
-from jaxid.result_table import Remark, Summarised, Table
+from jaxid.result_table import Remark, Summarised, Table, significant
 from jaxid.robot.collision_geometry import BodyShape
 from jaxid.robot.virtual_joints import GROUP
 from jaxid.validation.diagnosis import mistakes_in_logs
@@ -38,6 +38,8 @@ from .log_loading import LoadedLog, fitted_share, load_logs, select_filter
 from .robot_file import RobotFile, base_parameters_of, claimed_parameters
 from .setup import Paths, Progress, Setup, ignore_progress
 
+INTERVAL = 1.96
+"""Half a 95 % interval over the standard deviation."""
 MAX_COLUMNS = 5
 """Largest number of logs whose errors are shown one by one in few lines."""
 
@@ -87,7 +89,7 @@ class IdentificationReport(Summarised, Report):
         joint_errors = {name: logs for name, logs in groups.items() if logs}
         title = f"{robot.name}: {len(robot.driven)} joints, {base.size} base parameters"
         return [
-            Table(title, remarks=self.judgement.overview()),
+            Table(title, facts=total_mass(self.fit), remarks=self.judgement.overview()),
             error_table(joint_errors, robot.joint_names),
         ]
 
@@ -292,3 +294,20 @@ def errors_of_claims(setup: Setup, fit: Fit, logs: Sequence[Observations]) -> Cl
         load_errors = errors_of_parameters(fit, load_parameters, logs[:1])
     bodies = setup.robot_file.bodies()
     return Claims(errors, load_errors, claimed_parameters(values, base), bodies)
+
+
+def total_mass(fit: Fit) -> list[tuple[str, str]]:
+    """Return the total mass of a robot on legs with its 95 % interval; else nothing."""
+    base = fit.base
+    if not base.model.robot.floating:
+        return []
+    masses = np.zeros(base.model.size)
+    masses[: 10 * len(base.model.robot.solid_bodies) : 10] = 1.0
+    total = masses[list(base.indices)]
+    with np.errstate(invalid="ignore"):
+        variance = total @ np.asarray(fit.covariance) @ total
+    if not np.isfinite(variance):
+        return [("total mass", "not determined")]
+    mass = significant(float(total @ fit.parameters), 5)
+    width = significant(INTERVAL * float(np.sqrt(variance)), 2)
+    return [("total mass", f"{mass} ± {width} kg (95 %)")]

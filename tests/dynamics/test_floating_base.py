@@ -10,6 +10,7 @@ import trees
 
 import jaxid as jid
 from jaxid.dynamics.motion import floating_motion
+from jaxid.export.mujoco_model import mjcf_text
 
 ROBOTS = Path(pin.__file__).parents[4] / "share/example-robot-data/robots"
 # Ranks of the bodies of a dog and a humanoid (ANYmal C: 94, G1: 213).
@@ -105,3 +106,29 @@ def test_free_joint_of_an_mjcf_file(tmp_path):
     assert np.allclose(jid.robots.urdf_parameters(path, floating=True)[::10], [3, 1])
     with pytest.raises(jid.InputError, match="base"):
         jid.load_urdf(path, floating=True, base="wheel")
+
+
+def test_an_exported_robot_stands_on_its_feet_in_mujoco():
+    mujoco = pytest.importorskip("mujoco")
+    path = ROBOTS / "go2_description/urdf/go2.urdf"
+    if not path.exists():
+        pytest.skip("the robots of example-robot-data are not installed")
+    feet = {f"{leg}_foot": jid.Sphere(0.022) for leg in ("FL", "FR", "RL", "RR")}
+    robot = jid.load_urdf(path, floating=True, contacts=feet)
+    p = jid.robots.urdf_parameters(path, floating=True)
+    bodies = np.zeros((robot.bodies, 10))
+    bodies[list(robot.solid_bodies)] = np.reshape(p, (-1, 10))
+    spec = mujoco.MjSpec.from_string(mjcf_text(robot, bodies, {}))
+    spec.worldbody.add_geom(type=mujoco.mjtGeom.mjGEOM_PLANE, size=[1, 1, 0.1])
+    m = spec.compile()
+    assert m.body_mass.sum() == pytest.approx(p[::10].sum())
+    d = mujoco.MjData(m)
+    pose = np.tile([0.0, 0.8, -1.6], 4)
+    d.qpos[7:] = pose
+    d.qpos[2] = 0.32
+    for _ in range(2000):
+        d.ctrl[:] = 60.0 * (pose - d.qpos[7:]) - 2.0 * d.qvel[6:]
+        mujoco.mj_step(m, d)
+    touching = {m.geom(c.geom2).name for c in d.contact[: d.ncon]}
+    assert touching == {*feet}
+    assert 0.25 < d.qpos[2] < 0.32
