@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, double_precision
+from jaxid.arrays import AnyArray, Float, Texts, double_precision
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.open_directions import (
     OPEN_SHARES,
