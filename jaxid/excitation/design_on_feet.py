@@ -174,8 +174,9 @@ class DesignOnFeet:
             InputError: If not even the lean and the lift alone keep them.
         """
         checked = None
-        for attempt in range(MAX_SHRINKAGES + 1):
-            if attempt == MAX_SHRINKAGES:
+        shrinkages = MAX_SHRINKAGES if coefficients.any() else 0
+        for attempt in range(shrinkages + 1):
+            if attempt == shrinkages:
                 coefficients = np.zeros_like(coefficients)
             phase = self.motions.phase(number, coefficients)
             if phase.spline is not None:
@@ -283,6 +284,10 @@ def design_on_feet(
     shape = (motions.phases, *motions.shape)
     if begin is not None and begin.coefficients.shape != shape:
         raise InputError("`begin` must be a motion of the same robot and settings.")
+    # A robot that cannot even lean and lift its feet is refused at once.
+    for number in numbers:
+        still_waves = np.zeros(motions.shape)
+        design.candidate(number, still_waves, motions.times, random)
     waves = [motions.random(random) for _ in numbers]
     candidates = design.candidates(waves, random)
     design.sizes = typical_sizes(design.total(candidates))
