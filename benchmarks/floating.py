@@ -609,6 +609,9 @@ MOUNTINGS = {
     "accelerometer, bias of 0.1 m/s²": Mounting(
         accelerometer_bias=(0.06, -0.06, 0.053)
     ),
+    "accelerometer, horizontal bias of 0.1 m/s²": Mounting(
+        accelerometer_bias=(0.07, -0.07, 0.0)
+    ),
     "accelerometer, bias of 0.3 m/s²": Mounting(accelerometer_bias=(0.18, -0.17, 0.17)),
     "turned by 2 degrees": Mounting(turn=(1.2, -1.2, 1.1)),
     "turned by 90 degrees about z": Mounting(turn=(0.0, 0.0, 90.0)),
@@ -635,7 +638,7 @@ def imu_rows(name: str, seconds: float) -> list[Row]:
                 path = write(mounting.measured(log), Path(folder) / "log.csv", 5)
                 report = jid.identify_logs(setup, [path], COLUMNS)
             doubts = [x for x in report.judgement.findings if x.status in DOUBTS]
-            named = [x for x in doubts if "IMU" in x.text]
+            named = [x for x in doubts if "IMU" in x.text or "accelerometer" in x.text]
             mass, error = study.mass(report.fit)[0], study.torque_error(report.fit)
             word = "named" if named else "not named"
             texts.append(f"{mass:.3f} kg, {100 * error:.2f} %, {word}")

@@ -281,6 +281,44 @@ def rows_of(name, draws):
     return rows
 
 
+def cable_row(name):
+    """Return the row of an arm whose cable pulls at the load by 0.1 N m for each rad.
+
+    As `jaxid payload` says it, of one log.
+    """
+    import jaxid as jid
+
+    study = Study(name)
+    pull = 0.1 * np.array([0.7, -0.3, 0.65])
+    turns = study.motion[0][:, -1] - study.motion[0][0, -1]
+    wrench = study.wrench + BIAS + sensor_errors(np.random.default_rng(0), len(turns))
+    wrench[:, 3:] += np.outer(turns, pull)
+    with tempfile.TemporaryDirectory() as folder:
+        file, log = Path(folder, "e.toml"), Path(folder, "log.csv")
+        text = BASE_FILE.format(path=urdf_of(study.arm), tip=study.arm.flange)
+        file.write_text(text.replace("under_base = true", ""))
+        angles = [f"q{k + 1}" for k in range(len(study.arm.start))]
+        header = ",".join(["t", *angles, "fx", "fy", "fz", "tx", "ty", "tz"])
+        table = np.column_stack([study.t, study.motion[0], wrench])
+        np.savetxt(log, table, delimiter=",", header=header, comments="")
+        experiment = jid.experiment.load_experiment(file)
+        report = jid.workflow.identify_payload_from_logs(
+            experiment.setup, [], [log], experiment.columns, sensor=experiment.sensor
+        )
+    shift = report.result.centre_of_mass - np.array(study.arm.load.centre)
+    words = [x.text.partition(": ")[2] for x in report.findings if "cable" in x.text]
+    row = timing.Row(
+        f"wrist {name} cable",
+        "cable of 0.1 N m for each rad of the last joint: error of the centre",
+        f"{name}, {DURATION:g} s, one log",
+        "named",
+        f"{1e3 * np.linalg.norm(shift):.1f} mm; said: {words or 'nothing'}",
+        bool(words),
+    )
+    print(row.what, row.recipe, row.measured, flush=True)
+    return row
+
+
 BASE_FILE = """
 [robot]
 urdf = "{path}"
@@ -366,6 +404,7 @@ def main():
     timing.pin_to(1)
     draws = 3 if options.quick else 30
     rows = [row for name in ARMS for row in rows_of(name, draws)]
+    rows += [cable_row(name) for name in ARMS]
     rows += [row for name in ARMS for row in base_rows(name, options.quick)]
     timing.hand_over(rows, options.json)
 
