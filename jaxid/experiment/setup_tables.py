@@ -30,6 +30,7 @@ from jaxid.measurement.columns import (
 from jaxid.measurement.log_columns import Selection
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
+from jaxid.robot.virtual_joints import on_all_joints
 from jaxid.units import Unit
 from jaxid.workflow.robot_file import RobotFile
 from jaxid.workflow.setup import LogReading, Setup, pull_to_bodies
@@ -126,9 +127,7 @@ def _speed_of_term(
     if not isinstance(value, list):
         return float(value)
     # Virtual joints have no friction, whatever their speed is.
-    all_speeds = np.ones(robot.joints)
-    all_speeds[list(robot.driven)] = speeds
-    return all_speeds
+    return on_all_joints(robot, speeds, 1.0)
 
 
 SWITCHES = {name: term for name, term in terms.TERMS.items() if term.is_switch}

@@ -18,6 +18,7 @@ from jaxid.errors import InputError
 from jaxid.robot.contacts import legs_of
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
+from jaxid.robot.virtual_joints import on_all_joints
 
 from .filters import AbstractFilter
 from .recording import BaseSignals, Recording
@@ -164,8 +165,7 @@ def vertical(
 
 def _all_forces(robot: Robot, motion: Motion, forces: Matrix) -> Matrix:
     """Return the forces of all rows: those of the base come from standing legs."""
-    every_force = np.zeros((len(forces), robot.joints))
-    every_force[:, list(robot.driven)] = forces
+    every_force = on_all_joints(robot, forces)
     if motion.contacts is not None:
         legs = legs_of(robot)
         X = motion.contacts.reshape(len(forces), len(legs.rows), len(legs.joints))

@@ -10,7 +10,7 @@ from jaxid.errors import InputError
 from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.limits_and_drives import per_joint
 from jaxid.robot.robot import Robot
-from jaxid.robot.virtual_joints import GROUP
+from jaxid.robot.virtual_joints import GROUP, on_all_joints
 
 from .recording import Recording
 from .samples import MotionAndForces, joint_side
@@ -35,21 +35,17 @@ def refuse_missing_wrench(recording: Recording, robot: Robot) -> None:
         )
 
 
-def on_all_joints(
+def with_wrench(
     robot: Robot, motion: Motion, forces: AnyArray, wrench: AnyArray
 ) -> MotionAndForces:
     """Return motion and forces of all joints, from those of the driven ones.
 
     Virtual joints do not move; their forces are the wrenches of the sensors.
     """
-    columns = np.argsort([*robot.driven, *robot.rigid])
-    zeros = np.zeros(wrench.shape)
-
-    def joined(values: AnyArray, virtual_values: AnyArray) -> np.ndarray:
-        return np.hstack([values, virtual_values])[:, columns]
-
-    q, qd, qdd = (joined(x, zeros) for x in (motion.q, motion.qd, motion.qdd))
-    return Motion(q, qd, qdd), joined(forces, wrench)
+    q, qd, qdd = (on_all_joints(robot, x) for x in (motion.q, motion.qd, motion.qdd))
+    all_forces = on_all_joints(robot, forces)
+    all_forces[:, list(robot.rigid)] = wrench
+    return Motion(q, qd, qdd), all_forces
 
 
 def along_sensor_axes(recording: Recording, robot: Robot) -> Recording:
@@ -62,9 +58,7 @@ def along_sensor_axes(recording: Recording, robot: Robot) -> Recording:
     angles, _, _ = joint_side(
         robot, recording, recording.angles, None, np.zeros(recording.angles.shape)
     )
-    q = np.zeros((len(angles), robot.joints))
-    q[:, list(robot.driven)] = angles
-    attitudes = sensor_attitudes(robot, q)
+    attitudes = sensor_attitudes(robot, on_all_joints(robot, angles))
     on_ground = np.asarray(recording.wrench).reshape(-1, 2, 3)
     wrench = np.einsum("nji,nkj->nki", attitudes, on_ground)
     return dataclasses.replace(recording, wrench=wrench.reshape(-1, GROUP))
@@ -87,7 +81,5 @@ def speeds_of_all_joints(robot: Robot, min_speed: Numbers | None) -> Numbers | N
     """Return smallest speeds of rows that count; virtual joints have none."""
     if min_speed is None or not robot.virtual:
         return min_speed
-    speeds = np.zeros(robot.joints)
-    driven = list(robot.driven)
-    speeds[driven] = per_joint("min_speed", min_speed, len(driven), 0.0)
-    return speeds
+    speeds = per_joint("min_speed", min_speed, len(robot.driven), 0.0)
+    return on_all_joints(robot, speeds)

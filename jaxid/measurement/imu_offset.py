@@ -18,7 +18,7 @@ from jaxid.errors import InputError
 from jaxid.result_table import significant
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
-from jaxid.robot.virtual_joints import GROUP
+from jaxid.robot.virtual_joints import GROUP, on_all_joints
 
 from .filters import AbstractFilter
 from .floating_base import base_of, contact_grid, plane_normal
@@ -217,9 +217,7 @@ def _base_twist(robot: Robot, joints: Motion) -> tuple[np.ndarray, np.ndarray]:
 
     All are along the axes of the base; the contacts do not move.
     """
-    angles = np.zeros((len(joints.q), robot.joints))
-    angles[:, list(robot.driven)] = joints.q
-    feet = contact_tips(robot, angles)
+    feet = contact_tips(robot, on_all_joints(robot, joints.q))
     positions = np.stack([foot.position for foot in feet], axis=1)
     up = plane_normal(positions)
     jacobians = contact_jacobians(robot, feet, up)

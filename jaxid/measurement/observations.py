@@ -29,9 +29,9 @@ from .filters.filter import EVERY_SAMPLE
 from .floating_base import contact_grid, floating_samples
 from .force_sensors import (
     measured_joints,
-    on_all_joints,
     refuse_missing_wrench,
     speeds_of_all_joints,
+    with_wrench,
 )
 from .recording import (
     Recording,
@@ -392,7 +392,7 @@ def observe(
             motion = filter.motion(q[a:b], segment_qd, recording.sample_time)
             samples = (motion, forces[a:b])
             if recording.wrench is not None:
-                samples = on_all_joints(robot, *samples, recording.wrench[a:b])
+                samples = with_wrench(robot, *samples, recording.wrench[a:b])
             parts.append(samples)
         return SamplesInMemory(*joined(parts))
 

@@ -13,7 +13,7 @@ from typing import Any
 import numpy as np
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import Indices, Matrix3, Vector3
+from jaxid.arrays import AnyArray, Indices, Matrix3, Vector3
 from jaxid.errors import InputError
 
 from .limits_and_drives import of_joints
@@ -227,6 +227,16 @@ def driven_robot(robot: Any) -> Any:
         floating=False,
         contacts=(),
     )
+
+
+def on_all_joints(
+    robot: Any, values: AnyArray, virtual_value: float = 0.0
+) -> np.ndarray:
+    """Return values of all joints [*batch joints], from those of the driven ones."""
+    shape = (*np.shape(values)[:-1], robot.joints)
+    all_values = np.full(shape, virtual_value, float)
+    all_values[..., list(robot.driven)] = values
+    return all_values
 
 
 def with_moving_base(robot: Any) -> Any:

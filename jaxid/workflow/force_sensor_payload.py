@@ -23,7 +23,7 @@ from jaxid.measurement.log_columns import Selection
 from jaxid.measurement.observations import Observations
 from jaxid.robot.robot import Robot
 from jaxid.robot.rotations import rpy_rotation
-from jaxid.robot.virtual_joints import GROUP
+from jaxid.robot.virtual_joints import on_all_joints
 
 from .setup import Setup
 
@@ -78,13 +78,12 @@ class ForceSensor:
 
     def terms_on(self, setup: Setup) -> tuple[AbstractTerm, ...]:
         """Return the terms of the robot with the sensor, which adds virtual joints."""
-        joints = setup.robot.joints
-        widths = (GROUP, 0) if self.under_base else (0, GROUP)
+        robot = self.on(setup.robot)
 
         def with_virtual(values):
             # Virtual joints have no friction, whatever its constants are.
-            is_each = np.shape(values) == (joints,)
-            return np.pad(values, widths, constant_values=1.0) if is_each else values
+            is_each = np.shape(values) == (setup.robot.joints,)
+            return on_all_joints(robot, values, 1.0) if is_each else values
 
         return jax.tree.map(with_virtual, setup.model.terms)
 
