@@ -155,7 +155,7 @@ def common_step(
     return -scales * solution[..., 0]
 
 
-def divided(values: np.ndarray, scales: np.ndarray) -> np.ndarray:
+def divided(values: Vector, scales: np.ndarray) -> np.ndarray:
     """Return values in units of their scales; zero where the scale is zero."""
     has_scale = scales > 0.0
     divisors = np.where(has_scale, scales, 1.0)

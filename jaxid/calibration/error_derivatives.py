@@ -10,7 +10,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float
+from jaxid.arrays import Float, Vector
 from jaxid.robot.forward_kinematics import tip_jacobian
 from jaxid.robot.joint_coordinates import linear_ratios
 from jaxid.robot.robot import Robot
@@ -33,11 +33,11 @@ class Unknowns(NamedTuple):
     frames: Float[np.ndarray, "frames 6"]  # corrections of the first estimates
 
     @property
-    def vector(self) -> np.ndarray:
+    def vector(self) -> Vector:
         """All numbers in one row."""
         return np.concatenate([np.ravel(part) for part in self])
 
-    def of(self, vector: np.ndarray) -> "Unknowns":
+    def of(self, vector: Vector) -> "Unknowns":
         """Return unknowns of the same shapes."""
         sizes = [np.size(part) for part in self]
         parts = np.split(vector, np.cumsum(sizes)[:-1])

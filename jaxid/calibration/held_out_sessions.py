@@ -4,6 +4,8 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Matrix
+
 from .adjustment import Weights, adjust
 from .problem import CalibrationProblem, ErrorSizes
 from .solution import solve
@@ -48,9 +50,7 @@ def held_out_errors(problem: CalibrationProblem, has_compliance: bool) -> HeldOu
     )
 
 
-def nominal_solution_errors(
-    problem: CalibrationProblem, weights: Weights
-) -> np.ndarray:
+def nominal_solution_errors(problem: CalibrationProblem, weights: Weights) -> Matrix:
     """Return the errors of the nominal geometry with the best tools and places."""
     start = problem.nominal.vector
     end = adjust(problem, start, problem.frame_scales, weights)

@@ -9,7 +9,7 @@ import dataclasses
 import numpy as np
 import scipy
 
-from jaxid.arrays import Vector, double_precision
+from jaxid.arrays import Matrix, Vector, double_precision
 from jaxid.dynamics.motion import Motion
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
@@ -80,12 +80,12 @@ def propose_sessions(
     return [candidates[number] for number in best]
 
 
-def mean_place(fit: GeometryFit, q: np.ndarray) -> Vector:
+def mean_place(fit: GeometryFit, q: Matrix) -> Vector:
     """Return the mean position of the end-effector in some poses [m]."""
     return tip_jacobian(fit.robot, q).position.mean(axis=0)
 
 
-def _farthest(points: np.ndarray, others: np.ndarray, count: int) -> list[int]:
+def _farthest(points: Matrix, others: Matrix, count: int) -> list[int]:
     """Return points far from others and from each other, the farthest first."""
     distances = scipy.spatial.distance.cdist(points, others).min(axis=1)
     numbers = []
@@ -104,9 +104,7 @@ def _is_contact(fit: GeometryFit) -> bool:
     return bool(np.all(positions == positions[0]))
 
 
-def _possible_poses(
-    fit: GeometryFit, q: np.ndarray, clearance: Clearance | None
-) -> np.ndarray:
+def _possible_poses(fit: GeometryFit, q: Matrix, clearance: Clearance | None) -> Matrix:
     """Return the poses within the limits of the joints that keep a distance."""
     limits = complete_limits(fit.robot)
     is_inside = (q >= limits.position_min) & (q <= limits.position_max)
@@ -120,7 +118,7 @@ def _possible_poses(
     return q[np.max(excess, axis=1) <= 0.0]
 
 
-def _touching_poses(fit: GeometryFit, posture: Vector, q: np.ndarray) -> np.ndarray:
+def _touching_poses(fit: GeometryFit, posture: Vector, q: Matrix) -> Matrix:
     """Return poses near others, in which the tool is where it is in a posture."""
     first = fit.problem.poses
     keys = fit.problem.frame_keys

@@ -12,7 +12,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Float, Texts, Vector
+from jaxid.arrays import Float, Matrix, Texts, Vector
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import RigidBodies
 from jaxid.program.sample_methods import in_numpy
@@ -265,9 +265,7 @@ def build_problem(
     )
 
 
-def gravity_torques(
-    robot: Robot, bodies: BodyParameters | None, q: np.ndarray
-) -> np.ndarray:
+def gravity_torques(robot: Robot, bodies: BodyParameters | None, q: Matrix) -> Matrix:
     """Return the torques with which gravity turns the joints [N m or N]."""
     if bodies is None:
         return np.zeros((len(q), robot.joints))

@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from jaxid.arrays import Vector
+from jaxid.arrays import Matrix, Vector
 
 from .adjustment import SessionEquations, Weights, adjust, normal_matrices
 from .problem import CalibrationProblem
@@ -31,7 +31,7 @@ class ErrorLimits(NamedTuple):
 LIMITS = ErrorLimits()
 
 
-def pose_sizes(errors: np.ndarray, deviations: np.ndarray) -> np.ndarray:
+def pose_sizes(errors: np.ndarray, deviations: Matrix) -> np.ndarray:
     """Return the size of each pose's errors, of which the median is one for noise.
 
     Args:

@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxid.arrays import Matrix
 from jaxid.errors import InputError
 from jaxid.result_table import significant
 from jaxid.robot.robot import Robot
@@ -100,7 +101,7 @@ def _corrections(robot: Robot) -> Iterator[tuple[str, Callable]]:
     yield "with each measured pose the other way round (`eye_in_hand`)", _inverted
 
 
-def _with_joints(matrix: np.ndarray, observation: AbstractObservation):
+def _with_joints(matrix: Matrix, observation: AbstractObservation):
     """Return an observation whose joint coordinates are multiplied by a matrix."""
     if not observation.has_poses:
         return observation

@@ -17,6 +17,7 @@ from jaxid.arrays import (
     JointMatrix,
     Joints,
     ManyJoints,
+    Matrix,
     Numbers,
     Texts,
     as_array,
@@ -171,11 +172,11 @@ class BaseParameters(Summarised, Hashable):
         regressor = JointRegressor(self, self.columns, *shapes)
         return [np.asarray(rows).T for rows in regressor.evaluate(*arrays)]
 
-    def forces_in_numpy(self, p: AnyArray, motion: Motion) -> np.ndarray:
+    def forces_in_numpy(self, p: AnyArray, motion: Motion) -> Matrix:
         r"""Return the forces $\Theta_B p_B$ [N m or N] in float64 (Eq. 39)."""
         return in_numpy(self, self.forces, *self.model.arguments(motion), shared=(p,))
 
-    def tool_forces(self, motion: Motion) -> np.ndarray:
+    def tool_forces(self, motion: Motion) -> Matrix:
         """Return the forces of the known tool [N m or N] in float64."""
         model = self.model
         if model.robot.tool is None:

@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Float
+from jaxid.arrays import AnyArray, Float, Matrix, Vector
 from jaxid.program.sample_methods import in_numpy
 from jaxid.robot.loop_closing import reachable
 from jaxid.units.dimensions import length_power
@@ -103,7 +103,7 @@ def rank_by_singular_values(W: AnyArray, tolerance: float = 1e-6) -> int:
     return min(rank, int(np.count_nonzero(norms)))
 
 
-def _rank_at_largest_fall(s: np.ndarray, tolerance: float):
+def _rank_at_largest_fall(s: Vector, tolerance: float):
     """Return the rank, behind which singular values fall the most."""
     min_rank = int(np.count_nonzero(s > tolerance))
     ranks = np.arange(1, len(s))
@@ -118,7 +118,7 @@ def _rank_at_largest_fall(s: np.ndarray, tolerance: float):
 
 def scale_columns(
     W: AnyArray,
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Matrix, Vector]:
     """Return a matrix with columns of length one, and their lengths before.
 
     Columns that are nothing but rounding become zero, and so does their length.
@@ -176,7 +176,7 @@ def regrouping(
     return Regrouped(kappa, float(max_residual), shares)
 
 
-def random_regressor(model: Model, seed: int) -> tuple[np.ndarray, np.ndarray]:
+def random_regressor(model: Model, seed: int) -> tuple[Matrix, Vector]:
     r"""Return the regressor $\Theta_{QR}$ at random motions, free of units (Eq. 20).
 
     Lengths are measured in the robot's own size, so that metres or millimetres make no
@@ -211,12 +211,12 @@ def random_motion(model: Model, samples: int, seed: int) -> Motion:
     return Motion(q, qd, qdd)
 
 
-def row_units(model: Model) -> np.ndarray:
+def row_units(model: Model) -> Vector:
     """Return the units of the coordinates: 1 rad, or the robot's size [m]."""
     return np.where(np.array(model.robot.revolute), 1.0, characteristic_length(model))
 
 
-def column_units(model: Model) -> np.ndarray:
+def column_units(model: Model) -> Vector:
     """Return the units of the parameters: powers of the robot's size."""
     size = characteristic_length(model)
     return np.array([size ** length_power(unit) for unit in model.parameter_units])

@@ -13,7 +13,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Texts
+from jaxid.arrays import Matrix, Texts, Vector
 from jaxid.dynamics.base import BaseParameters, base_parameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm, LoadFriction, StribeckFriction, Tanh
@@ -248,7 +248,7 @@ class ModelSearch:
 
     def _fit(
         self, setup: Setup, logs: Sequence[Observations]
-    ) -> tuple[RegressionProblem, np.ndarray]:
+    ) -> tuple[RegressionProblem, Vector]:
         """Fit the model, and return its rows and weights of the joints."""
         base = find_friction_constants(base_parameters(self._model()), logs)
         problem = RegressionProblem(base, logs, divisions=DIVISIONS)
@@ -366,7 +366,7 @@ class ModelSearch:
         priors, ridges = self._priors(base)
         return UnseenParts(training, judged, priors, ridges)
 
-    def _priors(self, base: BaseParameters) -> tuple[np.ndarray, np.ndarray]:
+    def _priors(self, base: BaseParameters) -> tuple[Matrix, Vector]:
         """Return the bodies near which the fits stay, and how strongly."""
         priors = np.zeros((self.parts.size, base.size))
         first_columns = [base.names.index(name) for name in self._names_of_fit]

@@ -6,7 +6,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Joints, Texts, double_precision
+from jaxid.arrays import Joints, Matrix, Texts, double_precision
 from jaxid.dynamics.terms import AbstractTerm
 from jaxid.errors import InputError
 from jaxid.identification.consistency.pseudo_inertia import consistency_margin
@@ -74,7 +74,7 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
     return JointDynamics(values, tuple(rotors), tuple(omissions))
 
 
-def _unit_forces(term: AbstractTerm, robot: Robot, role: str) -> np.ndarray:
+def _unit_forces(term: AbstractTerm, robot: Robot, role: str) -> Matrix:
     """Return the forces of unit parameters for a unit of what their role acts on."""
     standstill = np.zeros(robot.joints)
     motion = np.ones(robot.joints)

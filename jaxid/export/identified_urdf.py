@@ -7,7 +7,7 @@ import numpy as np
 from lxml import etree  # pyright: ignore[reportAttributeAccessIssue]
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import AnyArray, Texts, Vector
+from jaxid.arrays import AnyArray, Matrix, Texts, Vector
 from jaxid.errors import InputError
 from jaxid.identification.consistency import consistency_margin
 from jaxid.identification.fit_result import Fit
@@ -119,7 +119,7 @@ def _replace_inertials(tree: UrdfTree, bodies: BodyParameters) -> None:
 
 def _without_side_branches(
     tree: UrdfTree, bodies: BodyParameters
-) -> tuple[np.ndarray, list[str]]:
+) -> tuple[Matrix, list[str]]:
     """Subtract from the bodies what joints beside the chain carry, such as fingers.
 
     Where that leaves no possible body, the joints become fixed. Return the bodies, and

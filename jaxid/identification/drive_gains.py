@@ -12,7 +12,7 @@ import equinox as eqx
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Float, Joints, Texts
+from jaxid.arrays import AnyArray, Float, Joints, Matrix, Texts, Vector
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.result_table import Remark, Status, Summarised, Table, percent
@@ -192,7 +192,7 @@ def _solve(fits, maps, offsets) -> tuple["Rows", np.ndarray]:
     return rows, solution.x
 
 
-def _misfit(rows: "Rows", unknowns: np.ndarray) -> float:
+def _misfit(rows: "Rows", unknowns: Vector) -> float:
     """Return the share of the forces that stays unexplained (norms)."""
     residuals, _ = rows.linearise(unknowns)
     return float(np.linalg.norm(residuals) / np.linalg.norm(rows.measured_forces))
@@ -211,7 +211,7 @@ def _require_gains(robot: Robot) -> None:
         )
 
 
-def _are_plausible(reciprocals: np.ndarray) -> np.ndarray:
+def _are_plausible(reciprocals: Vector) -> np.ndarray:
     """Return which gains are positive, and neither tiny nor huge."""
     return (reciprocals > 1 / MAX_GAIN) & (reciprocals < MAX_GAIN)
 
@@ -227,7 +227,7 @@ class Rows(NamedTuple):
     measured_forces: np.ndarray
     joints: np.ndarray  # one for the joint of each row, otherwise zero [rows, joints]
 
-    def linearise(self, unknowns: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def linearise(self, unknowns: Vector) -> tuple[Vector, Matrix]:
         """Return predicted less measured forces, and their derivatives by unknowns."""
         size = self.columns.shape[1]
         reciprocals = self.joints @ unknowns[size:]

@@ -8,7 +8,7 @@ import equinox as eqx
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Float, Joints
+from jaxid.arrays import AnyArray, Float, Joints, Matrix, Vector
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.measurement.filters import AbstractFilter, Subsample, ZeroPhaseButterworth
@@ -107,7 +107,7 @@ class FilterChoice(eqx.Module):
         return self.candidates[self.best]
 
     @property
-    def curve(self) -> np.ndarray:
+    def curve(self) -> Vector:
         """Held-out error of each candidate on the whole log."""
         return np.sqrt(np.mean(np.square(self.errors), axis=1))
 
@@ -320,7 +320,7 @@ def _mask_ends(observations: Observations, edge: int) -> Observations:
 
 def _held_out_errors(
     problem: RegressionProblem, test: RegressionProblem, estimator, joint_weights
-) -> np.ndarray:
+) -> Vector:
     """Return the error on each part of time, relative to the forces of all parts.
 
     The parameters come from the other parts of `problem`, the rows from `test`.
@@ -342,7 +342,7 @@ def _removes_noise(
     problem: RegressionProblem,
     wider_problem: RegressionProblem,
     estimator: AbstractEstimator,
-    joint_weights: np.ndarray,
+    joint_weights: Vector,
 ) -> bool:
     """Return whether the motion between two cut-off frequencies is noise.
 
@@ -364,9 +364,7 @@ def _removes_noise(
     return bool(error_growth > errors[0] + LIMITS.noise * force_growth)
 
 
-def _best_candidate(
-    squares: np.ndarray, is_eligible: np.ndarray, usual_number: int
-) -> int:
+def _best_candidate(squares: Matrix, is_eligible: np.ndarray, usual_number: int) -> int:
     """Return the candidate with the smallest error, or the usual one if it is as good.
 
     Args:

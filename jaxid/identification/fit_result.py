@@ -362,7 +362,7 @@ class Fit(Summarised, eqx.Module):
                 Column("naive ±", naive_deviations, format=lambda x: significant(x, 2)),
                 Column("ratio", ratios, format=lambda x: significant(x, 2)),
             ]
-            typical_ratio = significant(float(np.median(finite_ratios)), 2)
+            typical_ratio = significant(np.median(finite_ratios), 2)
             text = (
                 f"Standard deviations are {typical_ratio} times (median) those of "
                 "independent rows, because errors of neighbouring rows are correlated."

@@ -133,7 +133,7 @@ def excess(runs: Runs) -> float:
     if len(runs) < 2:
         return 1.0
     squares = [departure(run, without(runs, run)).mean_square for run in runs]
-    return max(1.0, float(np.median(squares)))
+    return max(1.0, np.median(squares))
 
 
 def without(runs: Runs, run: Run) -> list[Run]:
@@ -195,7 +195,7 @@ def explain(run: Run, others: Runs) -> Cause:
     """Return the cause that explains the difference of a run with fewest numbers."""
     x = departure(run, others)
     scale = excess(others)
-    total = float(x.difference @ x.difference) / scale
+    total = x.difference @ x.difference / scale
     best = Cause("", np.zeros(0), np.zeros(0))
     # Each unknown must pay for itself, as in the Bayesian information criterion.
     best_score = total
@@ -205,7 +205,7 @@ def explain(run: Run, others: Runs) -> Cause:
         if rank < changes.shape[1]:
             continue
         rest = x.difference - columns @ sizes
-        score = float(rest @ rest) / scale + rank * np.log(x.size)
+        score = rest @ rest / scale + rank * np.log(x.size)
         if score < best_score:
             best_score = score
             covariance = scale * np.linalg.inv(columns.T @ columns)
@@ -250,7 +250,7 @@ def _pool_kind(estimates: Matrix, variances: Matrix, correlation: Matrix):
     _, ratios = _weighted_spread(estimates, information)
     between = 0.0
     if (counts > 1).any():
-        between = max(0.0, float(np.nanmean(ratios)) - 1.0)
+        between = max(0.0, np.nanmean(ratios) - 1.0)
     weights = 1.0 / (variances + between * typical_variances)
     means, ratios = _weighted_spread(estimates, weights)
 
@@ -341,7 +341,7 @@ def kind_factors(runs: Runs, pool: Vector, kinds: Texts) -> KindFactors:
         system = x.whitening @ columns
         values = np.linalg.lstsq(system, x.difference, rcond=1e-9)[0]
         rest = x.difference - system @ values
-        scale = max(1.0, float(rest @ rest) / max(1, x.size - len(values)))
+        scale = max(1.0, rest @ rest / max(1, x.size - len(values)))
         variances = scale * np.diag(np.linalg.pinv(system.T @ system))
         factors.append(values)
         deviations.append(np.sqrt(variances))
@@ -366,7 +366,7 @@ def drifts(factors: KindFactors) -> list[Drift]:
         solution = np.linalg.lstsq(columns, values, rcond=None)[0]
         rest = values - columns @ solution
         dof = count - 2
-        scale = float(rest @ rest) / dof
+        scale = rest @ rest / dof
         covariance = scale * np.linalg.inv(columns.T @ columns)
         deviation = np.sqrt(covariance[1, 1])
         chance = 2.0 * scipy.special.stdtr(dof, -abs(solution[1]) / deviation)

@@ -12,7 +12,7 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike
 
-from jaxid.arrays import AnyArray, Float, JointSamples, Texts, Vector
+from jaxid.arrays import AnyArray, Float, JointSamples, Matrix, Texts, Vector
 from jaxid.errors import InputError
 
 from .time_grid import MIN_SAMPLES, Ranges, TimeGrid, resampling
@@ -292,7 +292,7 @@ def _base_channels(
 
 def finite_channel(
     name: str, key: str, value: ArrayLike, shape: tuple[int, ...], first_row: int
-) -> np.ndarray:
+) -> Matrix:
     """Return a channel as finite real numbers."""
     array = np.asarray(value, np.float64)
     if array.ndim != 2 or array.shape != shape:

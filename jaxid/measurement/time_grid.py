@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from jaxid.arrays import Texts, Vector
+from jaxid.arrays import Matrix, Texts, Vector
 from jaxid.errors import InputError
 
 from .time_stamps import burst_length, even_stamps, stamp_order
@@ -310,7 +310,7 @@ class Resampling(NamedTuple):
     grid: TimeGrid
     times: list[Vector]  # times of each segment's samples [s]
 
-    def __call__(self, x: np.ndarray) -> np.ndarray:
+    def __call__(self, x: Matrix) -> Matrix:
         """Return the samples of a channel: its rows, or values of cubic splines."""
         x = x[self.rows]
         segments = []

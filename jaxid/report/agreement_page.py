@@ -21,7 +21,7 @@ def agreement_answer(agreement: Agreement) -> Answer:
     """Return what the page of an agreement says and shows."""
     count = len(agreement.runs)
     agreeing = count - len(agreement.odd)
-    spread = significant(float(np.sqrt(np.nanmean(agreement.spreads))), 2)
+    spread = significant(np.sqrt(np.nanmean(agreement.spreads)), 2)
     return Answer(
         "Agreement of runs",
         agreement.verdict.text.rstrip("."),

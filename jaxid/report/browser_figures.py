@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from markupsafe import Markup
 
+from jaxid.arrays import Matrix
+
 from .figure_elements import Curve, Drawing, Panel, Scene, Solids, decimate
 
 Content = dict[str, Any]
@@ -141,7 +143,7 @@ def _solids_content(solids: Solids) -> Content:
     }
 
 
-def _coordinates(points: np.ndarray) -> Content:
+def _coordinates(points: Matrix) -> Content:
     """Return the coordinates of points by their axes, as plotly takes them."""
     return {axis: _floats(points[:, k]) for k, axis in enumerate("xyz")}
 

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxid.arrays import Vector
+from jaxid.arrays import Matrix, Vector
 from jaxid.calibration import GeometryFit, propose_sessions
 from jaxid.calibration.pose_proposals import mean_place
 from jaxid.errors import InputError
@@ -220,7 +220,7 @@ def workspace_figure(fit: GeometryFit) -> Figure:
     return Figure(f"errors in the workspace, {fit.manner}", panels, columns=2)
 
 
-def _classes(places: np.ndarray, lengths: Vector, names: np.ndarray) -> list[Curve]:
+def _classes(places: Matrix, lengths: Vector, names: np.ndarray) -> list[Curve]:
     """Return the poses of each class of errors as points."""
     classes = np.searchsorted(np.quantile(lengths, QUANTILES), lengths)
     curves = []

@@ -69,7 +69,7 @@ def _comparison_panel(comparison: Comparison, shown: np.ndarray) -> Panel:
                 low=np.clip((estimate - half_width) / scale, -2.0, 2.0),
                 high=np.clip((estimate + half_width) / scale, -2.0, 2.0),
                 texts=[
-                    f"{name}: {significant(float(value), 4)}"
+                    f"{name}: {significant(value, 4)}"
                     for name, value in zip(names, estimate, strict=True)
                 ],
             )

@@ -10,7 +10,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Indices
+from jaxid.arrays import AnyArray, Indices, Vector
 
 # The palette of Okabe and Ito, which colour-blind readers can tell apart. Orange and
 # sky are darker than theirs, so that lines have a contrast of 3 to 1 on white.
@@ -105,7 +105,7 @@ class Solids(NamedTuple):
 class Scene:
     """Robot along a motion in space."""
 
-    time: np.ndarray  # (samples,): their instants [s]
+    time: Vector  # (samples,): their instants [s]
     points: np.ndarray  # (samples, points, 3): all bodies' origins, and the tip [m]
     # body from whose origin the line to each point leads; -1 for the ground
     links: Indices
@@ -125,7 +125,7 @@ class Scene:
         return np.stack([starts, self.points], axis=2)
 
     @property
-    def mean(self) -> np.ndarray:
+    def mean(self) -> Vector:
         """Mean of the values of all joints."""
         if self.values is None:
             return np.zeros(len(self.time))
@@ -167,7 +167,7 @@ class Drawing:
 
 def decimate(
     time: AnyArray, values: AnyArray, bins: int = MAX_BINS
-) -> tuple[np.ndarray, np.ndarray]:
+) -> tuple[Vector, Vector]:
     """Return points of a line: all if they are few, else least and largest of each bin.
 
     A peak of one sample stays visible however long the log is. Gaps in time become NaN,

@@ -4,6 +4,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from jaxid.arrays import Matrix, Vector
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.motion import Motion
 from jaxid.identification.fit_result import Fit
@@ -68,7 +69,7 @@ def friction_figure(fit: Fit, logs: Sequence[TorqueErrors]) -> Figure:
     return Figure(f"{robot.name}: friction of the joints", panels, min(3, len(panels)))
 
 
-def _friction_columns(base: BaseParameters, speeds: np.ndarray) -> np.ndarray:
+def _friction_columns(base: BaseParameters, speeds: Matrix) -> np.ndarray:
     """Return the columns of the friction of joints that move alone."""
     count, joints = speeds.shape
     # Each joint moves alone at each speed; in the last sample all stand still.
@@ -86,7 +87,7 @@ def _friction_columns(base: BaseParameters, speeds: np.ndarray) -> np.ndarray:
     return columns[:-1] - columns[-1]
 
 
-def _half_widths(fit: Fit, columns: np.ndarray) -> np.ndarray:
+def _half_widths(fit: Fit, columns: np.ndarray) -> Matrix:
     """Return half the widths of 95 % intervals; NaN where they are undetermined."""
     covariance = np.nan_to_num(fit.covariance, posinf=0.0)
     variances = np.einsum("vjk,kl,vjl->vj", columns, covariance, columns)
@@ -97,7 +98,7 @@ def _half_widths(fit: Fit, columns: np.ndarray) -> np.ndarray:
     return half_widths
 
 
-def _confidence_band(model: Curve, half_widths: np.ndarray) -> Curve:
+def _confidence_band(model: Curve, half_widths: Vector) -> Curve:
     """Return the band of 95 % around the friction of the model."""
     low = model.y - half_widths
     high = model.y + half_widths
@@ -106,7 +107,7 @@ def _confidence_band(model: Curve, half_widths: np.ndarray) -> Curve:
     )
 
 
-def _measured_friction(model: Curve, speeds: np.ndarray, errors: np.ndarray) -> Curve:
+def _measured_friction(model: Curve, speeds: Vector, errors: Vector) -> Curve:
     """Return means of measured friction over classes of speed.
 
     Measured friction is that of the model less the torque errors.
@@ -138,7 +139,7 @@ def _is_of_body(base: BaseParameters) -> np.ndarray:
     return np.concatenate(is_of_body)[list(base.indices)]
 
 
-def _steady_columns(base: BaseParameters, q: np.ndarray, qd: np.ndarray) -> np.ndarray:
+def _steady_columns(base: BaseParameters, q: Matrix, qd: Matrix) -> np.ndarray:
     """Return the base regressor at constant speeds, with settled friction."""
     law = base.model.memory
     state = None if law is None else np.asarray(law.settled(qd))

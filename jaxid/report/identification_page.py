@@ -100,7 +100,7 @@ def _three_numbers(report: Report) -> Markup:
             f"torque error (RMS over RMS){band} {motion}",
         ),
         (
-            f"{percent(float(errors[worst_joint]))} %",
+            f"{percent(errors[worst_joint])} %",
             f"the same for the worst joint, {joint_name}",
         ),
         (

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Float, double_precision
+from jaxid.arrays import AnyArray, Float, Matrix, double_precision
 from jaxid.dynamics.motion import Motion
 from jaxid.program.sample_methods import in_numpy
 from jaxid.robot.collision import GROUND, Box, CollisionModel, HalfSpace
@@ -202,7 +202,7 @@ def even_indices(count: int, max_count: int) -> np.ndarray:
     return np.unique(places.round().astype(int))
 
 
-def _body_places(robot: Robot, q: np.ndarray) -> np.ndarray:
+def _body_places(robot: Robot, q: Matrix) -> np.ndarray:
     """Return rotation and origin of each body and the tip as [R r].
 
     The axes are samples, bodies and the tip, 3, 4.

@@ -131,7 +131,7 @@ def _error_text(errors: TorqueErrors, robot: Robot, j: int) -> str:
     """Return a joint's RMS error, and its share of the RMS force."""
     if not np.isfinite(errors.errors[:, j]).any():
         return "no row counts"
-    share = percent(float(errors.rms_relative[j]))
+    share = percent(errors.rms_relative[j])
     return (
         f"RMS error {significant(errors.rms[j], 2)} {robot.force_unit(j)} = {share} %"
     )
@@ -184,7 +184,7 @@ def bar_figure(
         shift = (k - middle_group) * (bar_width + 0.02)
         places = np.arange(joints) + shift
         shares = relative_joint_errors(recordings)
-        texts = [percent(float(share)) for share in shares] if show_numbers else []
+        texts = [percent(share) for share in shares] if show_numbers else []
         legend = f"{name}: {percent(relative_error(recordings))} % in all"
         colour = GROUP_COLOURS[k]
         bars.append(

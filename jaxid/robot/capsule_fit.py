@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Matrix3, Numbers, Vector3
+from jaxid.arrays import AnyArray, Matrix, Matrix3, Numbers, Vector, Vector3
 from jaxid.errors import InputError
 
 from .collision_geometry import Shape, link_shapes, mjcf_shapes
@@ -120,8 +120,8 @@ class LinkShapes(NamedTuple):
 
 def placed_shapes(
     tree: UrdfTree,
-    mount: np.ndarray,
-    place: np.ndarray,
+    mount: Matrix,
+    place: Vector,
     packages: str | Path | None = None,
     faults: dict[str, UnreadShapes] | None = None,
 ) -> Iterator[LinkShapes]:

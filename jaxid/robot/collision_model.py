@@ -16,6 +16,7 @@ from jaxid.arrays import (
     Hashable,
     Indices,
     Joints,
+    Matrix,
     Texts,
     double_precision,
 )
@@ -182,7 +183,7 @@ class CollisionModel(Hashable):
         """
         return jax.vmap(self._gaps)(ends)
 
-    def least_of_groups(self, gaps: np.ndarray) -> np.ndarray:
+    def least_of_groups(self, gaps: Matrix) -> Matrix:
         """Return the clearances [samples, groups] from the gaps of all pairs."""
         order = np.concatenate(self.groups)
         sizes = [len(group) for group in self.groups]

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Joints, Matrix3, Vector3
+from jaxid.arrays import Joints, Matrix, Matrix3, Vector3
 from jaxid.errors import InputError
 
 from .joint_coordinates import (
@@ -79,7 +79,7 @@ class TipJacobian(NamedTuple):
         return self.ratios.T @ np.concatenate([self.velocity, self.turn], axis=2)
 
 
-def tip_jacobian(robot: Robot, q: np.ndarray) -> TipJacobian:
+def tip_jacobian(robot: Robot, q: Matrix) -> TipJacobian:
     """Return placements of the end-effector in many poses, and their derivatives.
 
     Raises:

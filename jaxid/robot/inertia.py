@@ -10,6 +10,7 @@ from jaxid.arrays import (
     Float,
     Matrix3,
     Numbers,
+    Vector,
     Vector3,
     as_array,
     as_finite_array,
@@ -174,7 +175,7 @@ class Inertia(eqx.Module):
         return ""
 
 
-def ball_densities(bodies: BodyParameters) -> np.ndarray:
+def ball_densities(bodies: BodyParameters) -> Vector:
     """Return the densities of balls with the bodies' masses and moments [kg/m³].
 
     No body of even density with the same mass and sum of moments is less dense.

@@ -16,6 +16,7 @@ from jaxid.arrays import (
     ManyJoints,
     Numbers,
     Texts,
+    Vector,
     given,
     namespace,
 )
@@ -266,7 +267,7 @@ def _require(name: str, values: AnyArray, rule: Any, words: str):
         )
 
 
-def _require_ranges(low: np.ndarray, high: np.ndarray):
+def _require_ranges(low: Vector, high: Vector):
     """Reject ranges whose lower end is not below the upper one."""
     faults = np.flatnonzero(low >= high)
     if faults.size:
@@ -382,7 +383,7 @@ def listed(names: Sequence[str]) -> str:
     return words if len(names) <= 8 else f"{words} and {len(names) - 8} more"
 
 
-def are_degrees(rpy: np.ndarray):
+def are_degrees(rpy: Vector):
     """Return whether an attitude must be in degrees: people write whole or half ones.
 
     Programs that add up turns write angles in radians beyond a full turn.

@@ -10,7 +10,7 @@ import numpy as np
 import scipy
 from lxml.builder import E  # pyright: ignore[reportMissingModuleSource]
 
-from jaxid.arrays import Matrix3, Numbers, Vector3
+from jaxid.arrays import Matrix3, Numbers, Vector, Vector3
 from jaxid.errors import InputError
 from jaxid.io import import_extra
 
@@ -155,7 +155,7 @@ def body_name(model: Any, body: int) -> str:
     return model.body(body).name or f"body{body}"
 
 
-def rotation_of_quaternion(quaternion: np.ndarray) -> Matrix3:
+def rotation_of_quaternion(quaternion: Vector) -> Matrix3:
     """Return the rotation of MuJoCo's quaternion (w, x, y, z)."""
     turn = scipy.spatial.transform.Rotation.from_quat(np.roll(quaternion, -1))
     return turn.as_matrix()
@@ -415,7 +415,7 @@ class _Writer:
             words = "the resistance of a medium such as air or water"
             self.effects.append(Effect("option", "density", words, ""))
 
-    def _add_mimic(self, joint: int, master: int, polynomial: np.ndarray):
+    def _add_mimic(self, joint: int, master: int, polynomial: Vector):
         """Write a constraint of a joint; it is exact where the mimicked joint is held.
 
         The polynomial gives the joint's coordinate, as the difference from its `ref`,

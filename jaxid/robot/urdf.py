@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Joints, Numbers
+from jaxid.arrays import AnyArray, Joints, Numbers, Vector
 from jaxid.errors import InputError
 
 from .contacts import AbstractContactShape, Imu, contact_at, imu_at
@@ -301,9 +301,7 @@ def _limits(tree: UrdfTree):
     return limits, notes
 
 
-def _limit_by_followers(
-    tree: UrdfTree, low: np.ndarray, high: np.ndarray, velocity: np.ndarray
-):
+def _limit_by_followers(tree: UrdfTree, low: Vector, high: Vector, velocity: Vector):
     """Narrow the limits of joints, in place, by those of their followers."""
     joints = tree.joints[len(low) :]
     for joint, follower in zip(joints, tree.followers, strict=True):

@@ -5,7 +5,7 @@ from typing import Any
 import numpy as np
 import scipy
 
-from jaxid.arrays import Matrix3
+from jaxid.arrays import Matrix3, Vector
 from jaxid.errors import InputError
 
 from .rotations import rpy_rotation
@@ -61,7 +61,7 @@ class UrdfElements:
         default: tuple[float, ...],
         *,
         infinite: bool = False,
-    ) -> np.ndarray:
+    ) -> Vector:
         """Return the numbers of an attribute, or the default if it is missing."""
         text = None if element is None else element.get(key)
         if text is None:

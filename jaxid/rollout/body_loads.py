@@ -5,7 +5,7 @@ import dataclasses
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray
+from jaxid.arrays import AnyArray, Matrix, Vector
 from jaxid.dynamics.model import Model
 from jaxid.program.sample_methods import in_numpy
 
@@ -28,7 +28,7 @@ class Bodies:
     coupled: bool = False
 
     def loads(
-        self, paths: np.ndarray, velocities: np.ndarray, step_times: np.ndarray
+        self, paths: np.ndarray, velocities: np.ndarray, step_times: Vector
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the torques between two points of paths, and inertias of the joints.
 
@@ -52,7 +52,7 @@ class Bodies:
         return torques, inertias
 
     def measured_loads(
-        self, positions: np.ndarray, sample_times: np.ndarray
+        self, positions: np.ndarray, sample_times: Vector
     ) -> tuple[np.ndarray, np.ndarray]:
         """Return the loads of measured positions, whose noise is filtered out."""
         smooth_positions = [
@@ -67,8 +67,8 @@ class Bodies:
         return self.loads(paths, np.stack(velocities), sample_times)
 
     def _path_loads(
-        self, path: np.ndarray, velocity: np.ndarray, dt: float
-    ) -> tuple[np.ndarray, np.ndarray]:
+        self, path: Matrix, velocity: Matrix, dt: float
+    ) -> tuple[Matrix, Matrix]:
         """Return torques and inertias [joints, points - 1] of one path."""
         q = 0.5 * (path[1:] + path[:-1])
         zeros = np.zeros_like(q)
@@ -89,7 +89,7 @@ class Bodies:
         return (torques - inertias * qdd).T, inertias.T
 
 
-def _filter_positions(positions: np.ndarray, dt: float) -> np.ndarray:
+def _filter_positions(positions: Matrix, dt: float) -> Matrix:
     """Return positions below `CUTOFF`."""
     if 0.4 / dt < CUTOFF:
         return positions

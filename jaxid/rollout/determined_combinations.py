@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from jaxid.arrays import Vector
+from jaxid.arrays import Matrix, Vector
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.identification.uncertainty.spectral import sandwich_of_columns
 
@@ -46,7 +46,7 @@ class Combination:
     name: str
     meaning: str
     unit: str
-    coefficients: np.ndarray
+    coefficients: Vector
     value: float
     deviation: float
     dof: float
@@ -109,9 +109,7 @@ def determined_combinations(
     return Determination(tuple(combinations), uncertainty)
 
 
-def _scatter_of_equal_joints(
-    fit: JointFit, groups: Sequence[Sequence[int]]
-) -> np.ndarray:
+def _scatter_of_equal_joints(fit: JointFit, groups: Sequence[Sequence[int]]) -> Matrix:
     """Return the deviations of parameters between equal joints [joints, parameters].
 
     Of estimates without the pull that makes them alike. Biases are each joint's own.
@@ -210,7 +208,7 @@ class _Joint(NamedTuple):
         factor = deviation / np.sqrt(np.maximum(squares, 1e-300))
         return Deviations(B * np.outer(factor, factor), dof, ~is_scattered)
 
-    def _changes_by_stretches(self, symbols: np.ndarray, B: np.ndarray) -> np.ndarray:
+    def _changes_by_stretches(self, symbols: np.ndarray, B: Matrix) -> Matrix:
         """Return changes of estimates by the errors of each stretch of the motions.
 
         Stretches end in the middle between two reversals.
@@ -286,7 +284,7 @@ def stretch_starts(path: Vector) -> np.ndarray:
     return np.unique([0, *middles])
 
 
-def _description(symbol: int, coefficients: np.ndarray) -> tuple[str, str]:
+def _description(symbol: int, coefficients: Vector) -> tuple[str, str]:
     """Return name and meaning of a parameter and those that are merged into it."""
     name, meaning, *_ = PARAMETERS[symbol]
     merged = [m for m in np.flatnonzero(coefficients) if m != symbol]
@@ -305,7 +303,7 @@ def unit_of_joint(unit: str, joint: int, bodies: Bodies | None) -> str:
     return linear_unit.replace("rad", "m")
 
 
-def _inverse(H: np.ndarray) -> np.ndarray:
+def _inverse(H: Matrix) -> Matrix:
     """Return the inverse of an information matrix, finite where nothing is known."""
     size = np.sqrt(np.maximum(np.diag(H), 1e-30))
     values, vectors = np.linalg.eigh(H / np.outer(size, size))
@@ -313,7 +311,7 @@ def _inverse(H: np.ndarray) -> np.ndarray:
     return scaled_inverse / np.outer(size, size)
 
 
-def _merge(covariance: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _merge(covariance: Matrix, reach: Vector) -> tuple[np.ndarray, Matrix]:
     """Return which relative parameters are determined, and how others merge into them.
 
     A parameter is determined if its deviation is at most `MAX_RELATIVE_DEVIATION` when

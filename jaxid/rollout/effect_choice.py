@@ -5,7 +5,7 @@ from collections.abc import Callable, Sequence
 
 import numpy as np
 
-from jaxid.arrays import Indices, Texts
+from jaxid.arrays import Indices, Matrix, Texts, Vector
 
 from .joint_fits import JointFit
 from .motion import FreeParameters, JointParameters
@@ -53,8 +53,8 @@ def parameter_mask(symbols: Sequence[str]) -> np.ndarray:
 
 
 def is_lower(
-    scores: np.ndarray,
-    rivals: np.ndarray,
+    scores: Matrix,
+    rivals: Matrix,
     groups: Groups,
     scatter_share: float = 1.0,
 ) -> np.ndarray:
@@ -92,7 +92,7 @@ class EffectChoice:
 
     fit: JointFit
     groups: Groups
-    known_compliance: np.ndarray
+    known_compliance: Vector
     advance: Callable[[], None]
 
     @classmethod
@@ -100,7 +100,7 @@ class EffectChoice:
         cls,
         simulator: ServoSimulator,
         groups: Groups,
-        known_compliance: np.ndarray,
+        known_compliance: Vector,
         advance: Callable[[], None],
     ) -> "EffectChoice":
         """Fit joints with basic parameters, from the best of many starts."""
@@ -220,7 +220,7 @@ class EffectChoice:
             return self.loaded_joints & (self.fit.parameters[:, INDEX["a"]] > 0.0)
         return np.ones(len(self.known_compliance), bool)
 
-    def _start_values(self, symbol: str) -> np.ndarray:
+    def _start_values(self, symbol: str) -> Vector:
         """Return values at which an effect is active: otherwise it has no gradient."""
         simulator = self.fit.simulator
         motion = simulator.motion
@@ -241,7 +241,7 @@ class EffectChoice:
         return values[symbol]
 
 
-def _largest_loads(simulator: ServoSimulator) -> np.ndarray:
+def _largest_loads(simulator: ServoSimulator) -> Vector:
     """Return the largest torque of the bodies on each joint [N m or N]."""
     torques, _ = simulator.loads
     return np.abs(torques).max(axis=(0, 2))
@@ -330,7 +330,7 @@ def _calm_choice(first: JointFit, second: JointFit, groups: Groups) -> JointFit:
     state excites may imitate the rounding of an encoder.
     """
 
-    def damping_ratios(fit: JointFit) -> np.ndarray:
+    def damping_ratios(fit: JointFit) -> Vector:
         inertia = fit.parameters[:, INDEX["J"]]
         damping = fit.parameters[:, INDEX["B"]]
         return np.minimum(0.5 * damping / np.sqrt(inertia), OSCILLATION_DAMPING)

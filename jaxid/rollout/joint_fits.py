@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxid.arrays import Matrix
+from jaxid.arrays import Matrix, Vector
 
 from .motion import FreeParameters, JointParameters
 from .servo import INDEX, LOWER, SCALE, UPPER
@@ -149,7 +149,7 @@ class JointFit:
         return 1.0 / spread**2 / motion.sample_counts[..., None]
 
     @cached_property
-    def cost(self) -> np.ndarray:
+    def cost(self) -> Vector:
         """Weighted squares of each joint, with those of states and pull."""
         states = self.start - self.simulator.motion.start
         state_costs = np.sum(self.certainty * states**2, axis=-1)
@@ -199,7 +199,7 @@ class JointFit:
             deviations[j, symbols] = np.sqrt(variance)
         return deviations
 
-    def step(self, damping: np.ndarray) -> "tuple[JointParameters, np.ndarray]":
+    def step(self, damping: Vector) -> "tuple[JointParameters, np.ndarray]":
         """Return parameters and initial states behind a damped Gauss-Newton step."""
         equations = self.equations
         change = self._parameter_step(

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import Texts, Vector
+from jaxid.arrays import Matrix, Texts, Vector
 from jaxid.identification.run_to_run import Run
 from jaxid.identification.uncertainty import Uncertainty
 from jaxid.measurement.recording import Recording
@@ -211,7 +211,7 @@ class ServoFit(Summarised):
         states = simulator.states(self.parameters, start)
         return simulator, State(*(x[..., :: simulator.steps] for x in states))
 
-    def _balanced_integrals(self, simulator: ServoSimulator) -> np.ndarray:
+    def _balanced_integrals(self, simulator: ServoSimulator) -> Matrix:
         """Return initial integral actions, which balance the load at rest."""
         motion = simulator.motion
         ratios = {symbol: self.parameters[:, k] for symbol, k in INDEX.items()}

@@ -7,7 +7,7 @@ import equinox as eqx
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Float, is_traced, namespace
+from jaxid.arrays import AnyArray, Float, Matrix, is_traced, namespace
 from jaxid.errors import InputError
 
 from .trajectory import (
@@ -139,7 +139,7 @@ class RestToRestSplineBasis(AbstractBasis):
         return tuple(control_points), 1.0
 
 
-def interpolate_at_rest(t: Times, points: np.ndarray) -> "scipy.interpolate.BSpline":
+def interpolate_at_rest(t: Times, points: Matrix) -> "scipy.interpolate.BSpline":
     """Return the quintic spline through points at times, at rest at both ends."""
     conditions = [(order, np.zeros(points.shape[1])) for order in (1, 2)]
     return scipy.interpolate.make_interp_spline(

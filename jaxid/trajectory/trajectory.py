@@ -18,6 +18,7 @@ from jaxid.arrays import (
     Array,
     Float,
     Hashable,
+    Vector,
     namespace,
     require_float64,
 )
@@ -79,7 +80,7 @@ class AbstractTrajectory(Hashable):
         """Number of joints."""
         return jax.eval_shape(lambda: self.motion(0.0)).q.shape[-1]
 
-    def sample(self, sample_time: float) -> tuple[np.ndarray, Motion]:
+    def sample(self, sample_time: float) -> tuple[Vector, Motion]:
         """Return times from the start to the end [s], and the motion at them.
 
         Args:

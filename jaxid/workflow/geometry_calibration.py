@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING, Any, Literal, NamedTuple
 import numpy as np
 import scipy
 
+from jaxid.arrays import Vector
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 from jaxid.excitation.constraints import Clearance
@@ -92,7 +93,7 @@ class CalibrationSettings:
         """Length unit [m]."""
         return 1e-3 if self.length_unit == "mm" else 1.0
 
-    def radians(self, robot: Robot) -> np.ndarray:
+    def radians(self, robot: Robot) -> Vector:
         """Return the unit of each joint's coordinate [rad or m]."""
         angle = np.deg2rad(1.0) if self.angle_unit == "deg" else 1.0
         return np.where(robot.revolute, angle, 1.0)

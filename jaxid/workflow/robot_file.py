@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import Float, Numbers, Vector
+from jaxid.arrays import Float, Matrix, Numbers, Vector
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
 from jaxid.identification.consistency import consistency_margin
@@ -152,7 +152,7 @@ def claimed_parameters(claims: Mapping[str, float], base: BaseParameters) -> Vec
     return np.where(is_claimed, base_parameters_of(claims, base), np.nan)
 
 
-def _named_bodies(bodies: np.ndarray, first_number: int) -> dict[str, float]:
+def _named_bodies(bodies: Matrix, first_number: int) -> dict[str, float]:
     """Return the parameters of bodies by their names in a model."""
     return {
         f"{symbol}{number}": float(value)

@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Joints, matching, one_or_each
+from jaxid.arrays import Joints, Vector, matching, one_or_each
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 
@@ -233,6 +233,6 @@ class LinearSpring(AbstractTerm):
         return 0.5 * ((q - self.rest) ** 2)[np.array(robot.driven)]
 
 
-def _off_diagonal(ratios: np.ndarray):
+def _off_diagonal(ratios: Vector):
     """Return the products of the ratios of two different axes."""
     return np.outer(ratios, ratios) * (1.0 - np.eye(len(ratios)))

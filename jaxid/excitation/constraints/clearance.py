@@ -4,7 +4,7 @@ import equinox as eqx
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import AnyArray
+from jaxid.arrays import AnyArray, Vector
 from jaxid.program.sample_methods import evaluate_samples
 from jaxid.robot.collision import CollisionModel
 from jaxid.robot.robot import Robot
@@ -36,7 +36,7 @@ class Clearance(AbstractConstraint):
     distance: float = 0.03
 
     @property
-    def distances(self) -> np.ndarray:
+    def distances(self) -> Vector:
         """Least distance of each pair [m]."""
         return np.minimum(self.distance, 0.5 * np.array(self.model.room))
 

@@ -6,7 +6,7 @@ from typing import Any
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, Numbers, given, optional
+from jaxid.arrays import AnyArray, Float, Numbers, Vector, given, optional
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
 
@@ -128,7 +128,7 @@ def _span(values) -> str:
     return maximum if np.ptp(values) == 0 else f"{minimum} to {maximum}"
 
 
-def _of_each_body(name: str, value: Numbers, bodies: int) -> np.ndarray:
+def _of_each_body(name: str, value: Numbers, bodies: int) -> Vector:
     """Return numbers of each body, from numbers for each or for all."""
     array = np.array(value, np.float64)
     if np.isnan(array).any() or array.shape not in ((), (bodies,)):

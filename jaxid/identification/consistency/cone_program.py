@@ -11,7 +11,7 @@ from types import ModuleType
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, namespace
+from jaxid.arrays import AnyArray, Float, Matrix, namespace
 from jaxid.errors import InputError
 
 from .bounds_and_priors import BodyBounds
@@ -71,7 +71,7 @@ class ConeProgram(eqx.Module):
         return self.A.shape[-1] - self.bodies * self.width
 
     @property
-    def basis(self) -> np.ndarray:
+    def basis(self) -> Matrix:
         """Flattened pseudo-inertias of a body's unit variables."""
         return BASIS[: self.width].reshape(self.width, 16)
 
@@ -179,7 +179,7 @@ def _scale_rows(feasible: FeasibleSet, data: ScaledRows, scales):
     return A, b
 
 
-def _total_mass(feasible: FeasibleSet) -> np.ndarray:
+def _total_mass(feasible: FeasibleSet) -> Matrix:
     """Return the row of the total mass [rows, variables], or none if it is unknown.
 
     The row times the scaled variables is the sum of all masses over the total mass.

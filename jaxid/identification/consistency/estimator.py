@@ -6,7 +6,16 @@ from collections.abc import Iterable
 import equinox as eqx
 import numpy as np
 
-from jaxid.arrays import AnyArray, BaseVector, Bool, Float, Indices, Joints, Texts
+from jaxid.arrays import (
+    AnyArray,
+    BaseVector,
+    Bool,
+    Float,
+    Indices,
+    Joints,
+    Texts,
+    Vector,
+)
 from jaxid.dynamics.base import BaseParameters, Identifiability
 from jaxid.errors import InputError
 from jaxid.robot.robot import Robot
@@ -198,7 +207,7 @@ class PhysicallyConsistent(AbstractEstimator):
         if pull is None or pull.bodies is None or pull.strength is not None:
             return ChosenPull(pull, ())
 
-        def solve(factors: Factors, pull: EntropicPull) -> np.ndarray:
+        def solve(factors: Factors, pull: EntropicPull) -> Vector:
             estimator = dataclasses.replace(self, pull=pull)
             data, _, optimum = estimator._optimise(factors, weights, rows.base)
             return feasible.standard_parameters(data, optimum.y)

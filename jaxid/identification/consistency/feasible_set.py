@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 import scipy
 
-from jaxid.arrays import Indices, namespace
+from jaxid.arrays import Indices, Matrix, namespace
 from jaxid.dynamics.model import Model
 from jaxid.errors import InputError
 
@@ -56,7 +56,7 @@ class FeasibleSet(NamedTuple):
         return len(self.bodies[0])
 
     @property
-    def body_scales(self) -> np.ndarray:
+    def body_scales(self) -> Matrix:
         """Largest mass of each body, times 1, the radius and the squared radius."""
         mass = self.bounds.mass_max[:, None]
         radius = self.bounds.radius[:, None]

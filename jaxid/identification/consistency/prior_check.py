@@ -78,7 +78,7 @@ def choose_pull(
 
 def _unseen_squares(
     rows: RegressionProblem, weights: Joints, solve: Solve, pulls: list[EntropicPull]
-) -> np.ndarray:
+) -> Vector:
     """Return each pull's squared residuals on blocks that are left out in turn."""
     squares = np.zeros(len(pulls))
     for other_blocks, part in cross_validation_folds(rows.blocks):

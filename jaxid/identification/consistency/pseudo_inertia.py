@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from jaxid.arrays import AnyArray, Float, as_array, namespace
+from jaxid.arrays import AnyArray, Float, Vector, as_array, namespace
 
 Values = Any
 """Arrays of NumPy or JAX, and NumPy scalars."""
@@ -69,7 +69,7 @@ def inertial_parameters(pseudo: PseudoInertias) -> Bodies:
     return namespace(pseudo).stack(parameters, axis=-1)
 
 
-def ball(mass: np.ndarray, radius: np.ndarray) -> np.ndarray:
+def ball(mass: Vector, radius: Vector) -> np.ndarray:
     """Return the pseudo-inertias [*batch, 4, 4] of balls about the origin [kg, m]."""
     P = np.zeros((*mass.shape, 4, 4))
     # The second moment of a ball about its centre is m r² / 5 in each direction.

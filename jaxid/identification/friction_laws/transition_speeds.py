@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxid.arrays import Joints, Vector
+from jaxid.arrays import Joints, Matrix, Vector
 from jaxid.dynamics.base import BaseParameters
 from jaxid.dynamics.model import Model
 from jaxid.dynamics.terms import AbstractTerm, Tanh
@@ -114,7 +114,7 @@ class TrialColumns(AbstractTerm):
     """
 
     friction: Model
-    speeds: np.ndarray
+    speeds: Matrix
 
     def parameters(self, robot):
         """Return the terms' names, which a number makes different, and their units."""
@@ -153,7 +153,7 @@ class SpeedTrials:
     trials: np.ndarray
 
     @classmethod
-    def of(cls, base: BaseParameters, speeds: np.ndarray) -> "SpeedTrials":
+    def of(cls, base: BaseParameters, speeds: Matrix) -> "SpeedTrials":
         """Append the columns of trials with these speeds [trials, joints]."""
         model = base.model
         is_open = [has_open_transition(term) for term in model.terms]

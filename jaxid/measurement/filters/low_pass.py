@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 import scipy
 
-from jaxid.arrays import AnyArray, Float, Matrix
+from jaxid.arrays import AnyArray, Float, Matrix, Vector
 from jaxid.errors import InputError
 
 SETTLING_TOLERANCE = 1e-4
@@ -62,9 +62,7 @@ class LowPass(eqx.Module):
             result[:, block] = smooth_rows.T
         return result.reshape(x.shape)
 
-    def gain(
-        self, frequency: Float[AnyArray, " lines"], sample_time: float
-    ) -> np.ndarray:
+    def gain(self, frequency: Float[AnyArray, " lines"], sample_time: float) -> Vector:
         """Return the size of the gain for sinusoids of some frequencies [Hz]."""
         if not self.sections:
             return np.ones(np.shape(frequency))
