@@ -136,6 +136,7 @@ KEYS: dict[str, TomlTable] = {
         "gyro": Column,
         "accelerometer": Column,
         "contact": Column,
+        "contact_inverted": bool,
         "time": str | int | tuple[str | int, str | int],
         "sample_time": float,
         "time_unit": Unit,

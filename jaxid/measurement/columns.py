@@ -74,6 +74,7 @@ class Columns:
             `"acc{}"`.
         contact: Whether each foot stands (1) or not (0), like `"contact{}"`, in the
             order of the robot's contacts.
+        contact_inverted: Whether 1 means that a foot does not stand.
         time: Time stamps, or a list of two columns with seconds and nanoseconds;
             `sample_time`, or the clock of bags and LeRobot data sets, if None.
         sample_time: Time between two rows [s], instead of time stamps, like `0.001`.
@@ -117,6 +118,7 @@ class Columns:
     gyro: Selection | None = None
     accelerometer: Selection | None = None
     contact: Selection | None = None
+    contact_inverted: bool = False
     time: str | int | tuple[str | int, str | int] | None = None
     sample_time: float | None = None
     time_unit: Unit = S
@@ -252,6 +254,8 @@ class Columns:
             "contact": 1.0,
         }
         si = {name: values * scales[name] for name, values in channels.items()}
+        if self.contact_inverted and "contact" in si:
+            si["contact"] = 1.0 - si["contact"]
         offsets = numbers("angle_offsets", 0.0)
         for name in {"angles", "commands"} & si.keys():
             si[name] = si[name] + offsets

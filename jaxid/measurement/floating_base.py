@@ -104,7 +104,7 @@ def floating_samples(
         motion = _with_base(
             robot, joint_motion, signals_of_part, filter, recording.sample_time
         )
-        parts.append((motion, _all_forces(robot, motion, forces[samples])))
+        parts.append((motion, all_forces(robot, motion, forces[samples])))
     motion, every_force = joined(parts)
     stretches = [(motion[a:b], every_force[a:b]) for a, b in segments]
     return SamplesInMemory(*joined(stretches))
@@ -163,7 +163,7 @@ def vertical(
     return up / np.linalg.norm(up, axis=1, keepdims=True)
 
 
-def _all_forces(robot: Robot, motion: Motion, forces: Matrix) -> Matrix:
+def all_forces(robot: Robot, motion: Motion, forces: Matrix) -> Matrix:
     """Return the forces of all rows: those of the base come from standing legs."""
     every_force = on_all_joints(robot, forces)
     if motion.contacts is not None:

@@ -1,4 +1,4 @@
-"""Checks of a robot on legs: flags of contact, and the frame of its IMU.
+"""Checks of a robot on legs: its columns, the frame of its IMU, flags of contact.
 
 A foot that is wrongly called standing costs information only; one that is wrongly
 called in the air spoils the fit, since its leg then carries a force that the model does
@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 
 from jaxid.dynamics.base import BaseParameters
 from jaxid.errors import InputError
@@ -31,15 +32,20 @@ from jaxid.measurement.imu_offset import (
     ImuOffset,
     identify_imu_offset,
 )
-from jaxid.measurement.observations import observe
+from jaxid.measurement.observations import Progress, observe
 from jaxid.measurement.recording import Recording
 from jaxid.result_table import Remark, Status, percent, significant
 from jaxid.robot.contacts import legs_of
 from jaxid.robot.inertia import Inertia
 from jaxid.robot.robot import Robot
 
+from .leg_columns import column_mistakes
+from .mistake_search import ignore_progress
+
 STEP = 10
 """Samples for each row of the first fit, at most."""
+MAX_STRETCHES = 5
+"""Number of stretches with wrong flags that a finding lists."""
 
 
 class ContactLimits(NamedTuple):
@@ -56,6 +62,8 @@ class ContactLimits(NamedTuple):
     duration: float = 0.2  # shortest stretch that is judged [s]
     gravity: float = 0.05  # deviation of the mean acceleration, relative
     vertical_bias: float = 0.04  # the same [m/s²]; gravity on Earth differs by 0.03
+    correlation: float = 0.6  # gain of other flags, summed over the feet
+    exchange: float = 2.0  # correlation of exchanged flags, over that with their legs
     mass: float = 0.02  # effect of a mass at a lifted foot, over that in the trunk
     # rotation [rad], displacement [m] and biases of an IMU [rad/s, m/s²] that are
     # usual: norms of what intervals leave of the three axes
@@ -75,78 +83,144 @@ class CheckedContacts(NamedTuple):
     Attributes:
         recording: Recording in which loaded legs stand.
         findings: What needs a look.
-        mistakes: What is wrong with the IMU, so that no fit is right.
+        mistakes: What is wrong with columns, IMU or flags, so that no fit is right.
     """
 
     recording: Recording
-    findings: tuple[str, ...]
+    findings: tuple[str, ...] = ()
     mistakes: tuple[str, ...] = ()
 
 
+class LegTorques(NamedTuple):
+    """Torques that the legs lack if they are in the air.
+
+    Attributes:
+        times: Times of the rows [s].
+        stands: Whether each foot is called standing [rows feet].
+        missing: Norm of the torques that each leg lacks [rows feet].
+    """
+
+    times: np.ndarray
+    stands: np.ndarray
+    missing: np.ndarray
+
+
 def check_contacts(
-    base: BaseParameters, recording: Recording, filter: AbstractFilter
+    base: BaseParameters,
+    recording: Recording,
+    filter: AbstractFilter,
+    progress: Progress = ignore_progress,
 ) -> CheckedContacts:
-    """Return a recording in which loaded legs stand, and what its flags hide.
+    """Return a recording in which loaded legs stand, and what its columns hide.
+
+    What is wrong spoils all that is checked after it, which is then left out.
 
     Args:
         base: Base parameters of the robot, which has contacts.
         recording: Log of the robot.
         filter: Filter of the log.
+        progress: Callback, called with the completed fraction (0 to 1) of a search.
 
     Raises:
         InputError: If the recording lacks signals of the base.
     """
     robot = base.model.robot
-    findings = _constant_flags(robot, recording)
-    mistakes = []
-    for remark in imu_remarks(robot, recording, filter):
-        texts = mistakes if remark.status is Status.BAD else findings
-        texts.append(remark.text)
-    loads = _loads(base, all_standing(recording, robot), recording, filter)
+    mistakes = column_mistakes(base, recording, progress)
+    if mistakes:
+        return CheckedContacts(recording, mistakes=tuple(mistakes))
+    standing_torques = _missing_torques(
+        base, all_standing(recording, robot), recording, filter
+    )
+    flag_text = _flag_mistake(robot, standing_torques)
+    if flag_text:
+        return CheckedContacts(recording, mistakes=(flag_text,))
+    remarks = imu_remarks(robot, recording, filter)
+    imu_texts = tuple(remark.text for remark in remarks)
+    if any(remark.status is Status.BAD for remark in remarks):
+        return CheckedContacts(recording, mistakes=imu_texts)
+    loads = _loads(robot, recording, standing_torques)
     doubtful = {place: load for place, load in loads.items() if load > LIMITS.load}
-    if doubtful:
-        # A short log in which all feet stand tells too little of a leg to predict it;
-        # right flags explain its torques.
-        with contextlib.suppress(InputError):
-            unexplained = _loads(base, recording, recording, filter)
-            doubtful = {
-                place: load
-                for place, load in doubtful.items()
-                if unexplained.get(place, 0.0) > LIMITS.unexplained
-            }
+    if not doubtful:
+        return CheckedContacts(recording, imu_texts)
+    # A short log in which all feet stand tells too little of a leg to predict it;
+    # right flags explain its torques.
+    with contextlib.suppress(InputError):
+        torques = _missing_torques(base, recording, recording, filter)
+        unexplained = _loads(robot, recording, torques)
+        doubtful = {
+            place: load
+            for place, load in doubtful.items()
+            if unexplained.get(place, 0.0) > LIMITS.unexplained
+        }
+    return _with_loaded_feet(robot, recording, doubtful, imu_texts)
+
+
+def _with_loaded_feet(
+    robot: Robot,
+    recording: Recording,
+    doubtful: dict[tuple[int, int], float],
+    findings: tuple[str, ...],
+) -> CheckedContacts:
+    """Return the recording with standing feet where they carry load."""
     signals = base_of(recording, robot)
     stands = signals.stands.copy()
+    stretches = {}
     for (foot, sample), load in doubtful.items():
         start, stop = _stretch(signals.stands[:, foot], sample)
         stands[start:stop, foot] = True
-        findings.append(
-            f"`{robot.contacts[foot].name}` is called in the air from "
-            f"{recording.time[start]:.1f} s to {recording.time[stop - 1]:.1f} s, "
-            f"but its leg carries {100 * load:.0f} % of the load of a leg that stands: "
-            "it counts as standing; check `recording.contact`."
-        )
+        times = f"{recording.time[start]:.1f} s to {recording.time[stop - 1]:.1f} s"
+        name = robot.contacts[foot].name
+        stretches[foot, start] = f"`{name}` from {times} ({100 * load:.0f} %)"
+    if not stretches:
+        return CheckedContacts(recording, findings)
+    texts = list(stretches.values())
+    if len(texts) > MAX_STRETCHES:
+        texts[MAX_STRETCHES:] = [f"{len(texts) - MAX_STRETCHES} more"]
+    finding = (
+        f"feet are called in the air, but their legs carry load: {', '.join(texts)} of "
+        "that of a leg that stands: they count as standing there; check "
+        "`recording.contact`."
+    )
     signals = dataclasses.replace(signals, contacts=stands.astype(float))
     checked_recording = dataclasses.replace(recording, base=signals)
-    unique_findings = tuple(dict.fromkeys(findings))
-    return CheckedContacts(checked_recording, unique_findings, tuple(mistakes))
+    return CheckedContacts(checked_recording, (*findings, finding))
+
+
+def _flag_mistake(robot: Robot, torques: LegTorques) -> str:
+    """Return that all flags are inverted or in another order, as the loads tell."""
+    feet = len(robot.contacts)
+    # Most feet stand most of the time: how much load they carry then does not matter.
+    loads = np.minimum(torques.missing, np.median(torques.missing, axis=0))
+    # A flag that never changes tells nothing.
+    with np.errstate(invalid="ignore", divide="ignore"):
+        correlations = np.corrcoef(loads.T, torques.stands.T)
+    scores = np.nan_to_num(correlations[:feet, feet:])
+    own_score = np.trace(scores)
+    legs, flags = scipy.optimize.linear_sum_assignment(-scores)
+    exchanged_score = scores[legs, flags].sum()
+    if max(exchanged_score, -own_score) < own_score + LIMITS.correlation:
+        return ""
+    # Of four feet that are lifted in turn, exchanged flags have -1/3 with their own
+    # legs and 1 with the others; inverted ones have -1 and 1/3.
+    if exchanged_score < -LIMITS.exchange * own_score:
+        return (
+            "the flags of contact are inverted: legs carry load where their feet are "
+            "called in the air, and only there (`recording.contact_inverted = true`)."
+        )
+    names = [f"`{robot.contacts[foot].name}`" for foot in legs[flags != legs]]
+    return (
+        f"the flags of {' and '.join(names)} are exchanged: each tells when another "
+        "leg carries load (`recording.contact`, in the order of `robot.contacts`)."
+    )
 
 
 def _loads(
-    base: BaseParameters, log: Recording, recording: Recording, filter: AbstractFilter
+    robot: Robot, recording: Recording, torques: LegTorques
 ) -> dict[tuple[int, int], float]:
-    """Return the loads of legs in the air, relative to standing, by foot and sample.
-
-    Args:
-        base: Base parameters of the robot.
-        log: The recording, with the flags that are assumed in the fit.
-        recording: The recording, whose flags are checked.
-        filter: Filter of the log.
-    """
-    times, missing = _missing_torques(base, log, filter)
-    robot = base.model.robot
+    """Return the loads of legs in the air, relative to standing, by foot and sample."""
+    times, row_stands, missing = torques
     stands = base_of(recording, robot).stands
     log_times = np.asarray(recording.time)
-    row_stands = stands[np.clip(np.searchsorted(log_times, times), 0, len(stands) - 1)]
     sizes = [
         np.sqrt(np.mean(torque[is_standing] ** 2)) if is_standing.any() else 0.0
         for torque, is_standing in zip(missing.T, row_stands.T, strict=True)
@@ -161,9 +235,9 @@ def _loads(
         # A stretch without rows changes no fit.
         if b - a < min_samples or not is_inside.any():
             continue
-        torques = np.sqrt(np.mean(missing[is_inside] ** 2, axis=0))
+        torques_inside = np.sqrt(np.mean(missing[is_inside] ** 2, axis=0))
         for foot in np.flatnonzero(~stands[a]).tolist():
-            loads[foot, a] = float(torques[foot] / usual_sizes[foot])
+            loads[foot, a] = float(torques_inside[foot] / usual_sizes[foot])
     return loads
 
 
@@ -177,9 +251,16 @@ def _stretch(stands: np.ndarray, sample: int) -> tuple[int, int]:
 
 
 def _missing_torques(
-    base: BaseParameters, log: Recording, filter: AbstractFilter
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return times, and the torque that each leg lacks there if it is in the air."""
+    base: BaseParameters, log: Recording, recording: Recording, filter: AbstractFilter
+) -> LegTorques:
+    """Return the torques that each leg lacks if it is in the air.
+
+    Args:
+        base: Base parameters of the robot.
+        log: The recording, with the flags that are assumed in the fit.
+        recording: The recording, whose flags are checked.
+        filter: Filter of the log.
+    """
     robot = base.model.robot
     step = _row_step(filter, log.sample_time)
     rows = RegressionProblem(base, [observe(log, robot, filter, Subsample(step))])
@@ -189,10 +270,14 @@ def _missing_torques(
     # Legs feel what moves them, whatever stands.
     predicted = base.forces_in_numpy(parameters, motion)
     differences = predicted - np.asarray(observations.forces)[::step]
-    torques = []
+    missing = []
     for joints in legs_of(robot).own_joints:
-        torques.append(np.linalg.norm(differences[:, list(joints)], axis=1))
-    return observations.time[::step], np.stack(torques, axis=1)
+        missing.append(np.linalg.norm(differences[:, list(joints)], axis=1))
+    times = observations.time[::step]
+    stands = base_of(recording, robot).stands
+    samples = np.searchsorted(np.asarray(recording.time), times)
+    row_stands = stands[np.clip(samples, 0, len(stands) - 1)]
+    return LegTorques(times, row_stands, np.stack(missing, axis=1))
 
 
 def _row_step(filter: AbstractFilter, sample_time: float) -> int:
@@ -200,25 +285,6 @@ def _row_step(filter: AbstractFilter, sample_time: float) -> int:
     cutoff = filter.low_pass(sample_time).cutoff
     samples_of_half_period = 0.5 / (cutoff * sample_time)
     return max(1, min(STEP, int(np.ceil(samples_of_half_period)) - 1))
-
-
-def _constant_flags(robot: Robot, recording: Recording) -> list[str]:
-    """Return findings on flags that never change."""
-    stands = base_of(recording, robot).stands
-    names = [contact.name for contact in robot.contacts]
-    if stands.all():
-        return [
-            "all feet stand in the whole log: what a leg feels in the air is unknown, "
-            "so that inertias of the legs, their friction and rotors are not told "
-            "apart; lift one foot after another."
-        ]
-    never = [names[foot] for foot in np.flatnonzero(~stands.any(axis=0))]
-    if never:
-        return [
-            f"`{'`, `'.join(never)}` never stands in this log: check "
-            "`recording.contact`."
-        ]
-    return []
 
 
 def standing_feet_findings(fit: Fit) -> list[str]:

@@ -55,7 +55,7 @@ class Diagnosis(Summarised):
         notes: Remarks on how the log was examined, as sentences.
         commands: Excerpt with the commanded angles as angles; None if not known.
         is_mistaken: Whether a mistake in log or robot spoils any fit.
-        imu_mistakes: What is wrong with the IMU of a floating base, as sentences.
+        leg_mistakes: What is wrong with the log of a robot on legs, as sentences.
     """
 
     log: Recording | Observations
@@ -68,7 +68,7 @@ class Diagnosis(Summarised):
     notes: Texts = ()
     commands: Recording | None = None
     is_mistaken: bool = False
-    imu_mistakes: Texts = ()
+    leg_mistakes: Texts = ()
 
     def with_fit(self, fit: Fit, bodies: np.ndarray | None = None) -> "Diagnosis":
         """Return the diagnosis with findings of a fit to this log alone.
@@ -341,12 +341,12 @@ def _mistakes_in_base_wrenches(
     return LogMistakes(tuple(certain), tuple(doubts))
 
 
-def _mistakes_of_imus(diagnoses: Sequence[Diagnosis]) -> LogMistakes:
-    """Return what is wrong with the IMUs of a floating base."""
+def _mistakes_of_legs(diagnoses: Sequence[Diagnosis]) -> LogMistakes:
+    """Return what is wrong with the logs of a robot on legs."""
     texts = []
     for diagnosis in diagnoses:
         name = f"{diagnosis.log.name}: " if len(diagnoses) > 1 else ""
-        texts += [f"{name}{text}" for text in diagnosis.imu_mistakes]
+        texts += [f"{name}{text}" for text in diagnosis.leg_mistakes]
     return LogMistakes(tuple(texts))
 
 
@@ -362,7 +362,7 @@ def _mistakes(
         logs = [x.observations for x in diagnoses if x.observations is not None]
         return _mistakes_in_base_wrenches(model, logs)
     if model.robot.virtual:
-        return _mistakes_of_imus(diagnoses)
+        return _mistakes_of_legs(diagnoses)
     recordings = []
     commands = []
     doubts = []

@@ -177,9 +177,7 @@ def judge(report: Report) -> Judgement:
     bound_notes = ()
     if fit.consistency is not None:
         bound_notes = fit.consistency.findings(fit.base.model.robot)
-    findings = [
-        *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
-        *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
+    findings_on_fit = [
         *_judge_errors(report),
         fit.determination[0],
         _judge_mass_matrix(report.definiteness),
@@ -192,7 +190,18 @@ def judge(report: Report) -> Judgement:
         *_remarks_on_fit(report),
         *(Remark(note) for note in report.every_note if note not in bound_notes),
     ]
-    findings = sort_remarks(findings)
+    if report.mistakes:
+        # What a mistake spoils is no finding of its own.
+        findings_on_fit = [
+            dataclasses.replace(x, status=Status.NEUTRAL) for x in findings_on_fit
+        ]
+    findings = sort_remarks(
+        [
+            *(Remark(text, Status.BAD) for text in dict.fromkeys(report.mistakes)),
+            *(Remark(text, Status.DOUBTFUL) for text in dict.fromkeys(report.doubts)),
+            *findings_on_fit,
+        ]
+    )
     # Of a sentence that stands there twice, the most severe one counts.
     unique_findings = {finding.text: finding for finding in reversed(findings)}
     findings = list(reversed(unique_findings.values()))

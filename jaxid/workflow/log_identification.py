@@ -190,6 +190,11 @@ def identify_logs(
     notes += resolution_notes(fit, fitted_logs)
     notes += mistakes.remarks
     doubts = [text for log in loaded_logs for text in log.findings]
+    unseen_mistakes = [
+        f"{log.diagnosis.log.name}: {text}"
+        for log in loaded_logs[len(logs) :]
+        for text in log.diagnosis.leg_mistakes
+    ]
     claims = errors_of_claims(setup, fit, parts.every)
     return IdentificationReport(
         fit,
@@ -206,7 +211,7 @@ def identify_logs(
         },
         notes=(*setup.notes, *dict.fromkeys(notes)),
         doubts=[*doubts, *mistakes.doubts],
-        mistakes=mistakes.certain,
+        mistakes=(*mistakes.certain, *unseen_mistakes),
         claimed=claims.errors,
         claimed_loads=claims.load_errors,
         claimed_parameters=claims.parameters,

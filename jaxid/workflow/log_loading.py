@@ -172,9 +172,14 @@ def load_log(
     if name is not None:
         recording = dataclasses.replace(recording, name=name)
     progress(f"filtering {path.name}", 0.0)
-    checked = CheckedContacts(recording, ())
+    checked = CheckedContacts(recording)
     if setup.robot.contacts:
-        checked = check_contacts(setup.base, recording, setup.filter)
+        checked = check_contacts(
+            setup.base,
+            recording,
+            setup.filter,
+            partial(progress, f"looking through {path.name}"),
+        )
         recording = checked.recording
     observations = setup.observe(recording)
     commanded_motion = None
@@ -187,7 +192,7 @@ def load_log(
     )
     findings = (*diagnosis.findings, *checked.findings)
     diagnosis = dataclasses.replace(
-        diagnosis, findings=findings, imu_mistakes=checked.mistakes
+        diagnosis, findings=findings, leg_mistakes=checked.mistakes
     )
     observations = observations.replace(notes=(*observations.notes, *notes))
     return LoadedLog(observations, diagnosis)

@@ -193,6 +193,50 @@ def test_a_stance_called_swing_is_named_with_its_time(dog, base):
     assert np.array_equal(checked.recording.base.contacts, dog[1]["contact"])
 
 
+def scaled(joint, factor):
+    return lambda x: x * np.where(np.arange(12) == joint, factor, 1.0)
+
+
+def exchanged(first, second):
+    """Return a change of the order of columns."""
+
+    def change(x):
+        x = x.copy()
+        x[:, [*first, *second]] = x[:, [*second, *first]]
+        return x
+
+    return change
+
+
+@pytest.mark.parametrize(
+    ("keys", "change", "words"),
+    [
+        (["forces"], scaled(4, -1.0), ("sign of the force", "`b2`", "force_signs")),
+        (["forces"], scaled(7, 1e3), ("`c2`", "1000 times", "`recording.force_gains`")),
+        (["forces"], scaled(8, 1 / 9), ("`c3`", "`recording.force_gains` of 9.0")),
+        (["forces"], exchanged([1], [11]), ("forces of joints `a2` and `d3`",)),
+        (["angles"], exchanged([0, 1, 2], [9, 10, 11]), ("`afoot` and `dfoot`",)),
+        (["angles"], scaled(5, -1.0), ("sign of the angle", "`b3`", "angle_signs")),
+        (["contact"], lambda x: 1.0 - x, ("`recording.contact_inverted = true`",)),
+        (["contact"], exchanged([0], [1]), ("`afoot` and `bfoot` are exchanged",)),
+    ],
+)
+def test_wrong_columns_are_named_and_nothing_that_they_spoil(
+    dog, base, keys, change, words
+):
+    log = dog[1] | {key: change(dog[1][key]) for key in keys}
+    checked = findings(base, log)
+    assert checked.findings == ()
+    (text,) = checked.mistakes
+    assert all(word in text for word in words)
+
+
+def test_inverted_flags_are_read_as_they_are(dog):
+    columns = jid.Columns("q{}", "tau{}", contact="c{}", contact_inverted=True)
+    channels = {"angles": dog[1]["angles"], "contact": 1.0 - dog[1]["contact"]}
+    assert np.array_equal(columns.to_si(channels)["contact"], dog[1]["contact"])
+
+
 @pytest.mark.parametrize(
     ("key", "change", "words"),
     [
