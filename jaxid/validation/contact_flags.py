@@ -62,8 +62,7 @@ class ContactLimits(NamedTuple):
     duration: float = 0.2  # shortest stretch that is judged [s]
     gravity: float = 0.05  # deviation of the mean acceleration, relative
     vertical_bias: float = 0.04  # the same [m/s²]; gravity on Earth differs by 0.03
-    correlation: float = 0.6  # gain of other flags, summed over the feet
-    exchange: float = 2.0  # correlation of exchanged flags, over that with their legs
+    correlation: float = 0.6  # of flags with loads, summed over the feet, that tells
     mass: float = 0.02  # effect of a mass at a lifted foot, over that in the trunk
     # rotation [rad], displacement [m] and biases of an IMU [rad/s, m/s²] that are
     # usual: norms of what intervals leave of the three axes
@@ -196,17 +195,15 @@ def _flag_mistake(robot: Robot, torques: LegTorques) -> str:
         correlations = np.corrcoef(loads.T, torques.stands.T)
     scores = np.nan_to_num(correlations[:feet, feet:])
     own_score = np.trace(scores)
-    legs, flags = scipy.optimize.linear_sum_assignment(-scores)
-    exchanged_score = scores[legs, flags].sum()
-    if max(exchanged_score, -own_score) < own_score + LIMITS.correlation:
-        return ""
-    # Of four feet that are lifted in turn, exchanged flags have -1/3 with their own
-    # legs and 1 with the others; inverted ones have -1 and 1/3.
-    if exchanged_score < -LIMITS.exchange * own_score:
+    is_mostly_in_the_air = torques.stands.mean() < 0.5
+    if is_mostly_in_the_air and own_score < -LIMITS.correlation:
         return (
             "the flags of contact are inverted: legs carry load where their feet are "
             "called in the air, and only there (`recording.contact_inverted = true`)."
         )
+    legs, flags = scipy.optimize.linear_sum_assignment(-scores)
+    if scores[legs, flags].sum() < abs(own_score) + LIMITS.correlation:
+        return ""
     names = [f"`{robot.contacts[foot].name}`" for foot in legs[flags != legs]]
     return (
         f"the flags of {' and '.join(names)} are exchanged: each tells when another "
