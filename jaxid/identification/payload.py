@@ -104,6 +104,8 @@ class Payload(Summarised, eqx.Module):
         residuals: Residual of the fit without the load (NaN if there is none), and of
             the model with the load, relative to the forces.
         sensor: Bias and rotation of the force sensor; None without a sensor.
+        is_misread: Whether its wrench is surely not the one that is described: nothing
+            is then said of the body.
     """
 
     body: int = eqx.field(static=True)
@@ -114,6 +116,7 @@ class Payload(Summarised, eqx.Module):
     base_parameters: tuple[BaseVector, BaseVector]
     residuals: tuple[float, float]
     sensor: SensorEstimates | None = None
+    is_misread: bool = eqx.field(static=True, default=False)
 
     @property
     def mass(self) -> float:
@@ -219,15 +222,8 @@ class Payload(Summarised, eqx.Module):
 
     def _remarks(self) -> Iterator[Remark]:
         """Yield whether the payload is a body that could exist, and what is open."""
-        remark = self._remark()
-        yield remark
-        if remark.status is not Status.BAD and not self.has_inertia:
-            yield Remark(
-                "The runs do not determine the moments of inertia, as slow motion or "
-                "poses at rest never do: the table leaves them out. Mass and centre "
-                "are determined without them. Move the load faster if they are needed.",
-                Status.DOUBTFUL,
-            )
+        if not self.is_misread:
+            yield self._remark()
         if self.has_drifting_bias:
             yield Remark(
                 "The bias of the force sensor drifts: each part of the log has its "
@@ -260,6 +256,14 @@ class Payload(Summarised, eqx.Module):
                 "The logs do not determine mass and centre of the payload: move the "
                 "joints that carry it in more poses, and alike in both runs.",
                 Status.BAD,
+            )
+        # With moments of inertia that nothing tells no body is impossible.
+        if not self.has_inertia:
+            return Remark(
+                "The runs do not determine the moments of inertia, as slow motion or "
+                "poses at rest never do: the table leaves them out. Mass and centre "
+                "are determined without them. Move the load faster if they are needed.",
+                Status.DOUBTFUL,
             )
         if not np.isfinite(self.distance):
             return Remark("Whether such a body can exist is not known.")

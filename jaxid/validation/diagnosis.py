@@ -29,7 +29,7 @@ from jaxid.robot.virtual_joints import driven_robot
 
 from .clipped_forces import clipped_forces, limited_forces
 from .clock import clock_finding, held_forces
-from .limit_checks import LogStatistics, limit_findings
+from .limit_checks import MAX_REST, LogStatistics, limit_findings
 from .mistake_search import find_mistakes, ignore_progress
 from .sensor_checks import channel_findings, constant_forces, repeated_channels
 from .wrench_checks import wrench_remarks
@@ -174,6 +174,9 @@ def diagnose(
     excerpt = examined_log.excerpt
     # Channels are those of the driven joints; the other rows follow from an IMU.
     driven = robot.driven
+    # Gravity at rest tells a wrist sensor of its load.
+    is_at_wrist = bool(robot.sensor_bodies) and not robot.has_base_sensor
+    max_rest = 1.0 if is_at_wrist else MAX_REST
     robot = driven_robot(robot)
     statistics = _statistics(examined_log.all_observations, driven, progress)
     faults = channel_findings(robot, excerpt, statistics)
@@ -182,7 +185,7 @@ def diagnose(
     findings = [
         *dict.fromkeys(text for _, text in faults),
         *([clock_text] if clock_text else []),
-        *limit_findings(robot, statistics, faulty_joints),
+        *limit_findings(robot, statistics, faulty_joints, max_rest),
         *constant_forces(robot, excerpt),
         *repeated_channels(robot, excerpt),
         *held_forces(robot, excerpt),

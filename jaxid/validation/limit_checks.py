@@ -19,6 +19,8 @@ LIMITED_SHARE = 0.9
 Peaks are often larger, by noise of the velocities in the controller: of 140 clean logs
 6 % of the samples at most exceeded a limit by a tenth.
 """
+MAX_REST = 0.5
+"""Share of a log, in which all joints rest, that is better left out."""
 MIN_SPAN = 0.02
 """Smallest range of a joint that is a motion [rad or m]."""
 
@@ -91,11 +93,15 @@ class LogStatistics:
 
 
 def limit_findings(
-    robot: Robot, statistics: LogStatistics, faulty_joints: Collection[int]
+    robot: Robot,
+    statistics: LogStatistics,
+    faulty_joints: Collection[int],
+    max_rest: float = MAX_REST,
 ) -> list[str]:
     """Compare a log with the limits of its robot: a wrong unit or sign shows here.
 
     Joints in `faulty_joints` have faults of single channels, which explain more.
+    A larger share of the log than `max_rest`, in which all joints rest, is found.
     """
     spans = statistics.highest - statistics.lowest
     if spans.max() < MIN_SPAN:
@@ -108,7 +114,7 @@ def limit_findings(
         findings += _force_findings(robot, statistics, faulty_joints)
     findings += _motion_findings(robot, statistics, faulty_joints)
     share = float(statistics.stands.all(axis=1).mean())
-    if share > 0.5:
+    if share > max_rest:
         findings.append(
             f"the robot stands still for {100 * share:.0f} % of the log: crop it "
             "with `recording.start` and `recording.stop`."

@@ -36,6 +36,7 @@ class WrenchLimits(NamedTuple):
     distance: float = 0.01  # displacement that is not named [m]
     spoilt: float = np.deg2rad(10.0)  # rotation that spoils any result
     absent: float = 0.25  # share of gravity that lacks
+    unsure: float = 0.5  # error over an inertial mass that tells nothing
     tared: float = 0.1  # force at the start over gravity of the load
     min_mass: float = 0.02  # of a load [kg]
     stiffness: float = 0.01  # of a cable that is not named [N m/rad]
@@ -270,7 +271,10 @@ def _lever(wrench: SensorRows) -> float:
 def _missing_gravity(
     model: Model, observations: Observations, wrench: SensorRows
 ) -> str:
-    """Return that gravity in the wrench is not that of the load; else nothing."""
+    """Return that gravity in the wrench is less than that of the load; else nothing.
+
+    Poses at rest have no inertial mass to compare it with.
+    """
     weightless = Model(model.robot.replace(gravity=np.zeros(3)), model.terms)
     inertial = wrench_rows(weightless, observations)
     # Mass and first moments.
@@ -278,13 +282,13 @@ def _missing_gravity(
     estimate = inertial.beside(gravity).estimate()
     widths = half_widths(estimate.covariance)[3:]
     mass = estimate.unknowns[0]
-    difference = mass - estimate.unknowns[model.size]
-    width = LIMITS.slip * (widths[0] + widths[model.size])
-    if abs(difference) - width < LIMITS.absent * abs(mass):
+    mass_error, gravity_error = LIMITS.slip * widths[[0, model.size]] / abs(mass)
+    share = 1.0 - estimate.unknowns[model.size] / mass
+    is_missing = share - mass_error - gravity_error > LIMITS.absent
+    if mass_error > LIMITS.unsure or not is_missing:
         return ""
-    share = percent(abs(difference / mass))
     return (
-        f"{share} % of the gravity of the load is missing in the wrench: the "
+        f"{percent(share)} % of the gravity of the load is missing in the wrench: the "
         "controller or the driver takes it out. Set the load to zero there, and record "
         "again."
     )

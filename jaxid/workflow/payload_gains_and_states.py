@@ -187,7 +187,10 @@ def identify_payload_from_logs(
     remarks = [*runs.remarks, *runs.gain_doubts]
     if sensor is not None:
         payload = with_drifting_bias(payload, unloaded_fit, loaded_fit.base, logs, mass)
-        remarks += _wrench_remarks(setup, logs)
+        wrench_doubts = _wrench_remarks(setup, logs)
+        is_misread = any(x.status is Status.BAD for x in wrench_doubts)
+        payload = dataclasses.replace(payload, is_misread=is_misread)
+        remarks += wrench_doubts
     return payload_report(payload, loaded_fit, logs, runs.sources, remarks, progress)
 
 
