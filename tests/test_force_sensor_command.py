@@ -67,6 +67,8 @@ def test_a_payload_behind_a_sensor_needs_one_log(cell, run, tmp_path, monkeypatc
     assert abs(rows["rz4"]["estimate"] - TURN[2]) < 0.01
     assert abs(rows["bfz4"]["estimate"] - BIAS[2]) < 0.2
     page = (tmp_path / "payload" / "report.html").read_text("utf-8")
+    assert "The payload at the sensor has a mass" in page
+    assert "torque error" not in page
     assert "rotation of the force sensor" in page
     assert "sensor fz" in page
     # The exported model compensates the wrench of the load.
@@ -133,3 +135,41 @@ def test_refusals(cell, run, monkeypatch, tmp_path):  # noqa: F811
         assert refused(result, words.get(name, f"`{name}`"))
     command = ("payload", "e.toml", "--loaded", "short.csv", "--body", "j1")
     assert refused(run(*command), "`--body`")
+
+
+def report_on(cell, file, log):
+    experiment = jid.experiment.load_experiment(cell / file)
+    return jid.workflow.identify_payload_from_logs(
+        experiment.setup,
+        [],
+        [cell / log],
+        experiment.columns,
+        sensor=experiment.sensor,
+    )
+
+
+def test_a_wrong_sign_is_named_without_its_consequences(cell):
+    (cell / "n.toml").write_text(FILE.replace("sign = -1", "sign = 1"))
+    report = report_on(cell, "n.toml", "short.csv")
+    (finding,) = report.findings
+    assert "opposite sign" in finding.text
+    assert report.verdict == finding
+    assert not report.result.summary().remarks
+
+
+def test_clean_poses_at_rest_are_no_fault(cell):
+    rng = np.random.default_rng(5)
+    pose_times = np.repeat(np.arange(24.0), 400)
+    angles = poses(pose_times, 1.0) + 1e-5 * rng.normal(size=(len(pose_times), 3))
+    # At a hundredth of the speed only gravity is left.
+    static = wrench(100.0 * pose_times, 0.01)
+    measured = -noisy(static, 6)
+    # Moves between the poses are not recorded.
+    time = np.arange(len(angles)) / 100 + 10.0 * pose_times
+    rows = np.column_stack([time, angles, measured])
+    np.savetxt(cell / "rest.csv", rows, delimiter=",", header=HEADER, comments="")
+    report = report_on(cell, "e.toml", "rest.csv")
+    assert report.findings == []
+    assert abs(report.result.mass / LOAD.mass - 1.0) < 0.01
+    (remark,) = report.result.summary().remarks
+    assert "do not determine the moments" in remark.text

@@ -141,9 +141,12 @@ class Payload(Summarised, eqx.Module):
     @property
     def has_inertia(self) -> bool:
         """Whether the runs determine the moments of inertia: static poses do not."""
-        _, uncertainty = self.central
+        values, uncertainty = self.central
         half_widths = uncertainty.half_widths()[4:7]
-        return bool(half_widths.max() < abs(self.mass) * INERTIA_RADIUS**2)
+        is_precise = half_widths.max() < abs(self.mass) * INERTIA_RADIUS**2
+        # Noise at rest looks like impossible moments in narrow intervals.
+        is_noise = self.distance > MAX_DISTANCE and np.all(values[4:7] < half_widths)
+        return bool(is_precise and not is_noise)
 
     @property
     def tool(self) -> Tool:
@@ -244,7 +247,7 @@ class Payload(Summarised, eqx.Module):
         residual, loaded_residual = self.residuals
         if loaded_residual > MAX_RESIDUAL_RATIO * residual + SMALL_RESIDUAL:
             return Remark(
-                "No load explains the forces: the torque error of the model is "
+                "No load explains the forces: the error of the model is "
                 f"{percent(loaded_residual)} % with it, and {percent(residual)} % "
                 "without. Does another body carry the load? Or is the load set in the "
                 "robot's controller, which then subtracts its gravity from the "

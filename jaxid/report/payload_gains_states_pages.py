@@ -46,7 +46,12 @@ def payload_answer(
     joint = robot.body_names[payload.body]
     residual, loaded_residual = map(percent, payload.residuals)
     comparison = (f"{residual} %", "torque error on the logs without the payload")
+    place = f"on {joint}"
+    error = "torque error"
     if payload.sensor is not None:
+        place = "at the sensor"
+        # A sensor's log may have no torques.
+        error = "error"
         rotation = np.rad2deg(np.linalg.norm(payload.sensor.rotation))
         comparison = (
             f"{significant(rotation, 2)} deg",
@@ -69,13 +74,13 @@ def payload_answer(
         figures.insert(0, payload_figure(payload, robot, loaded[0]))
     return Answer(
         f"{robot.name}: payload",
-        f"The payload on {joint} has a mass of {mass} ± {half_width} kg, and the "
-        f"torque error of the model with it is {loaded_residual} %",
+        f"The payload {place} has a mass of {mass} ± {half_width} kg, and the {error} "
+        f"of the model with it is {loaded_residual} %",
         [
             (f"{mass} ± {half_width} kg", "mass, with its 95 % interval"),
             (
                 f"{loaded_residual} %",
-                "torque error (RMS over RMS) on the logs with the payload",
+                f"{error} (RMS over RMS) on the logs with the payload",
             ),
             comparison,
         ],
