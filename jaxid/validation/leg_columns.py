@@ -43,7 +43,6 @@ class LegSearch(NamedTuple):
     misfit: float = 0.2  # errors over median forces, up to which the order is right
     gain: float = 2.0  # fall of the score of a mistake
     share: float = 0.5  # of the misfit that a cure may leave
-    sign: float = 0.1  # deviation of a factor from -1 that is still a sign
     rounds: int = 4  # mistakes that are looked for one after another
 
 
@@ -185,7 +184,11 @@ def column_mistakes(
         sentences.append(mistake.sentence)
         log = LegColumns(base, log.mended(mistake))
         misfit = log.misfit(log.rows)
-    if not sentences or misfit > max(SEARCH.misfit, SEARCH.share * first_misfit):
+    # Of several mistakes, all must be found.
+    limit = SEARCH.misfit
+    if len(sentences) == 1:
+        limit = max(limit, SEARCH.share * first_misfit)
+    if not sentences or misfit > limit:
         return []
     effect = f"{percent(misfit)} % instead of {percent(first_misfit)} %"
     text = "; and ".join(sentences)
@@ -309,14 +312,18 @@ def _exchange(identity: Matrix, first: Sequence[int], second: Sequence[int]) -> 
 def _scaled_force(log: LegColumns, joint: int) -> ColumnMistake:
     """Return that a torque has the wrong sign or scale, as the others tell it."""
     factor = log.factor(joint)
-    cures = []
+    name = log.names[joint]
+    size = significant(1.0 / factor, 3)
+    sentence = (
+        f"the force of joint {name} in the log seems to be {size} times the true one "
+        f"(`recording.force_gains` of {significant(factor, 3)})"
+    )
     if factor < 0.0:
-        cures.append("`recording.force_signs`")
-    if abs(abs(factor) - 1.0) > SEARCH.sign:
-        cures.append(f"`recording.force_gains` of {significant(abs(factor), 3)}")
-    amount = f"{significant(1.0 / factor, 3)} times the true one"
-    text = f"the force of joint {log.names[joint]} in the log seems to be {amount}"
-    if len(cures) == 1 and factor < 0.0:
-        text = f"the sign of the force of joint {log.names[joint]} seems to be wrong"
+        # Another wrong column spoils the size of this one, which is tried afterwards.
+        factor = -1.0
+        sentence = (
+            f"the sign of the force of joint {name} seems to be wrong "
+            "(`recording.force_signs`)"
+        )
     scales = 1.0 + (factor - 1.0) * log.identity[joint]
-    return ColumnMistake(f"{text} ({', '.join(cures)})", log.identity, np.diag(scales))
+    return ColumnMistake(sentence, log.identity, np.diag(scales))
