@@ -27,6 +27,7 @@ from jaxid.result_table import (
     Status,
     Summarised,
     Table,
+    percent,
     significant,
 )
 from jaxid.robot.limits_and_drives import Limits
@@ -51,6 +52,8 @@ USUAL_NOISE = 0.01
 """Noise over the largest forces, where nothing else is known."""
 MAX_NAMED = 3
 """Combinations that are left open and named, the weakest ones."""
+MAX_RUNS = 10
+"""Runs of one motion that a user may repeat; above, another motion is better."""
 
 
 class DesignStatus(enum.StrEnum):
@@ -232,10 +235,12 @@ class ExcitationPlan(Summarised, eqx.Module):
         cure = "some of which it does not move at all"
         if math.isfinite(runs):
             cure = (
-                f"which make up to {100 * self.open_share:.2g} % of the forces of "
+                f"which make up to {percent(self.open_share)} % of the forces of "
                 f"other motions uncertain: {math.ceil(runs)} runs of this motion "
                 f"determine all, or one with {runs**-0.5:.2g} times the assumed noise"
             )
+            if runs > MAX_RUNS:
+                cure = f"{cure}; a longer search (`--time`) may find a better motion"
         text = f"One run leaves {count} combinations of {size} parameters open, {cure}"
         remarks = [Remark(text, status_of(self.open_share))]
         for direction in self.undetermined[:MAX_NAMED]:
