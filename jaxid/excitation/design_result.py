@@ -241,7 +241,8 @@ class ExcitationPlan(Summarised, eqx.Module):
             )
             if runs > MAX_RUNS:
                 cure = f"{cure}; a longer search (`--time`) may find a better motion"
-        text = f"One run leaves {count} combinations of {size} parameters open, {cure}"
+        combinations = "1 combination" if count == 1 else f"{count} combinations"
+        text = f"One run leaves {combinations} of {size} parameters open, {cure}"
         remarks = [Remark(text, status_of(self.open_share))]
         for direction in self.undetermined[:MAX_NAMED]:
             text = f"left open: {direction.sentence(self.base)}"

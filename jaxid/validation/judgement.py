@@ -221,7 +221,8 @@ def _verdict(report: Report, findings: Sequence[Remark]) -> Remark:
     # The end of a log is less new than another log.
     is_split = report.settings.get("split") is not None
     motion = "the rest of its logs" if is_split else "other logs"
-    text = f"its torque error on {motion} is {percent(error)} % (RMS)."
+    words = _error_words(report)
+    text = f"its {words} on {motion} is {percent(error)} % (RMS)."
     if error > ERRORS.good:
         text = f"A usable model: no other check found a problem, but {text}"
         return Remark(text, Status.NEUTRAL)
@@ -241,9 +242,15 @@ def _judge_errors(report: Report) -> Iterator[Remark]:
     yield from _judge_growth(report)
 
 
+def _error_words(report: Report) -> str:
+    """Return what the errors of all rows are: on legs the weight is most of it."""
+    is_on_legs = report.fit.base.model.robot.floating
+    return "error of forces on trunk and joints" if is_on_legs else "torque error"
+
+
 def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> Remark:
     """Judge torque errors on some logs; on those of the fit they are never good."""
-    names = report.fit.base.model.robot.joint_names
+    robot = report.fit.base.model.robot
     error = relative_error(logs)
     relative_errors = relative_joint_errors(logs)
     judged_errors = joint_errors(logs)
@@ -251,7 +258,12 @@ def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> 
     # Only if a joint is what is wrong, it is named by what it must do.
     is_joint_wrong = worst_error > ERRORS.doubtful_joint
     errors_of_joints = judged_errors if is_joint_wrong else relative_errors
-    worst_joint = int(np.argmax(errors_of_joints))
+    joints = range(robot.joints)
+    if robot.floating and not is_joint_wrong:
+        # Moments on a trunk are small beside its weight: no fault of a joint.
+        joints = robot.driven
+    worst_joint = max(joints, key=lambda joint: errors_of_joints[joint])
+    worst_share = percent(float(relative_errors[worst_joint]))
     status = Status.NEUTRAL
     if error <= ERRORS.good and logs is report.verification:
         status = Status.GOOD
@@ -260,9 +272,9 @@ def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> 
     if error > ERRORS.bad or worst_error > ERRORS.bad_joint:
         status = Status.BAD
     return Remark(
-        f"The torque error on {motion} is {percent(error)} % "
+        f"The {_error_words(report)} on {motion} is {percent(error)} % "
         f"(RMS{logs[0].band_words}); the largest is that of joint "
-        f"`{names[worst_joint]}`, {percent(float(relative_errors[worst_joint]))} %",
+        f"`{robot.joint_names[worst_joint]}`, {worst_share} %",
         status,
         f"Good: up to {100 * ERRORS.good:g} %; ! above {100 * ERRORS.doubtful:g} % "
         f"({100 * ERRORS.doubtful_joint:g} % of a joint), ✗ above "
