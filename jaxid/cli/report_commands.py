@@ -75,10 +75,10 @@ def export(
         case "urdf":
             source = urdf or source_urdf(fit)
             jid.export_urdf(fit, source, path, tip=tip, base=base)
-            show_omissions(console, path, fit, holds_rotors=False)
+            show_omissions(console, path, fit, is_urdf=True)
         case "mjcf":
             jid.export_mjcf(fit, path)
-            show_omissions(console, path, fit, holds_rotors=True)
+            show_omissions(console, path, fit, is_urdf=False)
         case "jax":
             jid.export.export_jax(fit, path)
         case "json":
@@ -86,16 +86,12 @@ def export(
     terminal.show_files(console, path.parent, files)
 
 
-def show_omissions(
-    console: Console, path: Path, fit: "jid.Fit", holds_rotors: bool
-) -> None:
+def show_omissions(console: Console, path: Path, fit: "jid.Fit", is_urdf: bool) -> None:
     """Print which effects of a model a file of a simulator cannot hold."""
     from jaxid.export.bodies_and_joint_dynamics import joint_dynamics
 
     dynamics = joint_dynamics(fit)
-    names = (
-        dynamics.omissions if holds_rotors else (*dynamics.rotors, *dynamics.omissions)
-    )
+    names = dynamics.missing_in_urdf if is_urdf else dynamics.omissions
     if names:
         # C code is for fixed bases only.
         is_floating = fit.base.model.robot.floating

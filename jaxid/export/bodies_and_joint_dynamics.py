@@ -34,11 +34,18 @@ class JointDynamics(NamedTuple):
             `friction` [N m or N] of all joints.
         rotors: Names of the parameters in `armature`.
         omissions: Names of the parameters in none of the three.
+        loops: That loops are closed, if the robot has any.
     """
 
     values: Quantities
     rotors: Texts
     omissions: Texts
+    loops: Texts
+
+    @property
+    def missing_in_urdf(self) -> Texts:
+        """Names of what a URDF file cannot hold."""
+        return (*self.loops, *self.rotors, *self.omissions)
 
 
 def joint_dynamics(fit: Fit) -> JointDynamics:
@@ -71,7 +78,8 @@ def joint_dynamics(fit: Fit) -> JointDynamics:
                 rotors.append(name)
             if role not in QUANTITIES:
                 omissions.append(name)
-    return JointDynamics(values, tuple(rotors), tuple(omissions))
+    loops = ("the closing of its loops",) if robot.loops else ()
+    return JointDynamics(values, tuple(rotors), tuple(omissions), loops)
 
 
 def _unit_forces(term: AbstractTerm, robot: Robot, role: str) -> Matrix:

@@ -82,7 +82,7 @@ def export_urdf(
     _require_same_robot(robot, file_robot, source)
     tree = UrdfTree(source, **place)
     dynamics = joint_dynamics(fit)
-    _replace_comment(tree.root, fit, (*dynamics.rotors, *dynamics.omissions))
+    _replace_comment(tree.root, fit, dynamics.missing_in_urdf)
     _replace_inertials(tree, bodies[first:])
     _write_joints(tree, robot, dynamics, first)
     document = tree.root.getroottree()
@@ -176,6 +176,8 @@ def _write_joints(
     efforts = np.append(robot.known_max_forces[first:], zeros + np.inf)
     for i, joint in enumerate(tree.joints):
         element = child_element(joint, "dynamics")
+        # That of an MJCF file is no part of a URDF, and not the identified one.
+        element.attrib.pop("armature", None)
         element.set("damping", exact_text(damping[i]))
         element.set("friction", exact_text(friction[i]))
         if np.isfinite(efforts[i]):

@@ -21,6 +21,7 @@ from .torque_errors import (
     Definiteness,
     TorqueErrors,
     Validation,
+    error_words,
     joint_errors,
     relative_error,
     relative_joint_errors,
@@ -221,7 +222,7 @@ def _verdict(report: Report, findings: Sequence[Remark]) -> Remark:
     # The end of a log is less new than another log.
     is_split = report.settings.get("split") is not None
     motion = "the rest of its logs" if is_split else "other logs"
-    words = _error_words(report)
+    words = error_words(report.fit)
     text = f"its {words} on {motion} is {percent(error)} % (RMS)."
     if error > ERRORS.good:
         text = f"A usable model: no other check found a problem, but {text}"
@@ -240,12 +241,6 @@ def _judge_errors(report: Report) -> Iterator[Remark]:
         return
     yield _error_remark(report, report.verification, "motion that the fit did not use")
     yield from _judge_growth(report)
-
-
-def _error_words(report: Report) -> str:
-    """Return what the errors of all rows are: on legs the weight is most of it."""
-    is_on_legs = report.fit.base.model.robot.floating
-    return "error of forces on trunk and joints" if is_on_legs else "torque error"
 
 
 def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> Remark:
@@ -272,7 +267,7 @@ def _error_remark(report: Report, logs: Sequence[TorqueErrors], motion: str) -> 
     if error > ERRORS.bad or worst_error > ERRORS.bad_joint:
         status = Status.BAD
     return Remark(
-        f"The {_error_words(report)} on {motion} is {percent(error)} % "
+        f"The {error_words(report.fit)} on {motion} is {percent(error)} % "
         f"(RMS{logs[0].band_words}); the largest is that of joint "
         f"`{robot.joint_names[worst_joint]}`, {worst_share} %",
         status,

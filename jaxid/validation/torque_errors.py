@@ -359,6 +359,12 @@ def relative_error(logs: Sequence[TorqueErrors]) -> float:
     return _relative([log.errors for log in logs], logs)
 
 
+def error_words(fit: Fit) -> str:
+    """Return what the errors of all rows are: on legs the weight is most of it."""
+    is_on_legs = fit.base.model.robot.floating
+    return "error of forces on trunk and joints" if is_on_legs else "torque error"
+
+
 def unexplained_error(logs: Sequence[TorqueErrors]) -> float:
     """Return the relative error that remains if the model is fitted to each log."""
     return _relative([log.unexplained for log in logs], logs)

@@ -8,6 +8,7 @@ from mechanisms import MECHANISMS, mjcf, projection
 
 import jaxid as jid
 from jaxid.errors import InputError
+from jaxid.export.bodies_and_joint_dynamics import joint_dynamics
 from jaxid.export.mujoco_model import mjcf_text
 from jaxid.report.parameter_words import in_words
 from jaxid.robot.loop_assembly import with_loops
@@ -339,6 +340,7 @@ def test_the_exported_function_takes_the_coordinates_of_the_motors(path):
     fit = jid.identify(base, observations)
     exported = jid.export.exported_function(fit)
     np.testing.assert_allclose(exported.call(*arrays), forces, atol=1e-6)
+    assert "the closing of its loops" in joint_dynamics(fit).missing_in_urdf
 
 
 @pytest.mark.parametrize("mechanism", [MECHANISMS["slider"]])

@@ -408,7 +408,7 @@ def test_joint_friction_is_that_of_parameters_with_a_role(fit):
     bodies = possible(jid.Model(model.robot, terms[:1]))
     forces = [2.0, 4.0, 1.0, 3.0, 3.0, 3.0, 1.0, 2.0, 3.0, 9, 9, 9, 9, 9]
     p = np.concatenate([bodies, forces])
-    joints, _, left_out = joint_dynamics(fit_of(model, p, full=True))
+    joints, _, left_out, _ = joint_dynamics(fit_of(model, p, full=True))
     cooled = np.exp(-0.02 * 15.0) * np.array([2.0, 4.0, 1.0])
     np.testing.assert_allclose(joints["damping"], cooled, rtol=1e-12)
     np.testing.assert_allclose(joints["friction"], [2.0, 2.5, 3.0], rtol=1e-12)
