@@ -55,6 +55,17 @@ def cell(tmp_path_factory):
     return folder
 
 
+def report_on(cell, file, log):
+    experiment = jid.experiment.load_experiment(cell / file)
+    return jid.workflow.identify_payload_from_logs(
+        experiment.setup,
+        [],
+        [cell / log],
+        experiment.columns,
+        sensor=experiment.sensor,
+    )
+
+
 def test_a_payload_behind_a_sensor_needs_one_log(cell, run, tmp_path, monkeypatch):  # noqa: F811
     for path in cell.iterdir():
         (tmp_path / path.name).symlink_to(path)
@@ -91,28 +102,14 @@ def test_a_wrench_along_the_axes_of_the_ground_is_turned(cell):
     (cell / "g.toml").write_text(FILE + "in_ground = true\n")
     found = []
     for file, log in (("e.toml", "short.csv"), ("g.toml", "ground.csv")):
-        experiment = jid.experiment.load_experiment(cell / file)
-        report = jid.workflow.identify_payload_from_logs(
-            experiment.setup,
-            [],
-            [cell / log],
-            experiment.columns,
-            sensor=experiment.sensor,
-        )
+        report = report_on(cell, file, log)
         assert not report.findings
         found.append(report.result.parameters)
     np.testing.assert_allclose(*found, rtol=1e-6, atol=1e-8)
 
 
 def test_a_bias_that_drifts_is_named(cell):
-    experiment = jid.experiment.load_experiment(cell / "e.toml")
-    report = jid.workflow.identify_payload_from_logs(
-        experiment.setup,
-        [],
-        [cell / "long.csv"],
-        experiment.columns,
-        sensor=experiment.sensor,
-    )
+    report = report_on(cell, "e.toml", "long.csv")
     assert "drifts" in str(report.result)
     assert abs(report.result.mass / LOAD.mass - 1.0) < 0.005
     assert abs(report.result.sensor.bias[0] - BIAS[0] - 0.5) < 0.2
@@ -135,17 +132,6 @@ def test_refusals(cell, run, monkeypatch, tmp_path):  # noqa: F811
         assert refused(result, words.get(name, f"`{name}`"))
     command = ("payload", "e.toml", "--loaded", "short.csv", "--body", "j1")
     assert refused(run(*command), "`--body`")
-
-
-def report_on(cell, file, log):
-    experiment = jid.experiment.load_experiment(cell / file)
-    return jid.workflow.identify_payload_from_logs(
-        experiment.setup,
-        [],
-        [cell / log],
-        experiment.columns,
-        sensor=experiment.sensor,
-    )
 
 
 def test_a_wrong_sign_is_named_without_its_consequences(cell):
