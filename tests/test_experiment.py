@@ -586,8 +586,9 @@ SIDES = (
     "joint_names",
     "wrench",
     "wrench_sign",
+    "in_ground",
 )
-"""Arguments of `Columns` that `side`, `forces_side`, robot and `[sensor]` tell."""
+"""Arguments of a reading that `side`, `forces_side`, robot and `[sensor]` tell."""
 
 
 def keys_by_table(name, functions):
