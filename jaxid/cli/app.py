@@ -160,7 +160,8 @@ def excite(
 
     options.refuse_foreign_table(output)
     content = jid.experiment.load_experiment(experiment)
-    with within("excitation", experiment.name):
+    with within("excitation", experiment.name), terminal.progress_bar() as progress:
+        progress("finding base parameters", 0.0)
         task = jid.workflow.prepare_motion(
             content.setup, content.excitation, content.surroundings, earlier_design
         )

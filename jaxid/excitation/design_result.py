@@ -83,7 +83,7 @@ class DesignProgress(NamedTuple):
         fraction: Completed fraction, from 0 to 1.
         task: Present task, in words.
         best: Value of the criterion for the best motion so far that keeps all limits,
-            or of the best of all if none does.
+            or of the best of all if none does; infinite where none is known yet.
         feasible: Whether it keeps all limits.
         trajectory: That motion.
     """

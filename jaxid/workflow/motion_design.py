@@ -283,8 +283,9 @@ def follow_design(
 
     def follow(step: DesignProgress) -> None:
         nonlocal best_value
+        value = f", best so far {step.best:.5g}" if np.isfinite(step.best) else ""
         limits = "" if step.feasible else ", limits not yet kept"
-        text = f"{step.task}, best so far {step.best:.5g}{limits}"
+        text = f"{step.task}{value}{limits}"
         progress(text, step.fraction)
         if improvement is not None and step.feasible and step.best < best_value:
             improvement(step.trajectory)
