@@ -199,14 +199,15 @@ def compared_on_feet(
     if clearance is None:
         return surroundings
     robot = with_moving_base(motions.robot)
-    is_near = np.zeros(len(clearance.model.groups), bool)
+    model = clearance.model
+    least_gaps = np.full(len(model.groups), np.inf)
     for number in range(motions.phases):
         phase = motions.phase(number, np.zeros(motions.shape))
         if phase.spline is not None:
             q = phase.motion(motions.times).q
-            gaps = np.asarray(clearance.model.clearance(robot, q))
-            is_near |= (gaps < clearance.distance).any(axis=0)
-    model = clearance.model
+            gaps = np.asarray(model.clearance(robot, q)).min(axis=0)
+            least_gaps = np.minimum(least_gaps, gaps)
+    is_near = least_gaps < clearance.distance
     names = [shape.name for shape in (*model.capsules, *model.obstacles)]
     pairs = []
     for number in np.flatnonzero(~is_near).tolist():
@@ -220,8 +221,11 @@ def compared_on_feet(
         f"{', '.join(near_names)}"
     )
     if pairs:
+        gaps_by_name = dict(zip(model.pair_names, least_gaps, strict=True))
         model = CollisionModel(robot, model.capsules, model.obstacles, pairs)
-        clearance = Clearance(model, clearance.distance)
+        gaps = np.array([gaps_by_name[name] for name in model.pair_names])
+        # Others could not move where a pair is hardly farther than asked.
+        clearance = Clearance(model, np.minimum(clearance.distance, 0.5 * gaps))
     return surroundings._replace(
         clearance=clearance if pairs else None,
         notes=(*surroundings.notes, note) if near_names else surroundings.notes,

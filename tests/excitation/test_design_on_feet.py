@@ -21,6 +21,7 @@ from jaxid.robot.leg_kinematics import (
     place_feet,
     standing_pose,
 )
+from jaxid.robot.virtual_joints import with_moving_base
 from jaxid.trajectory.files import load_trajectory
 
 pin = pytest.importorskip("pinocchio")
@@ -150,6 +151,18 @@ def test_feet_stay_where_they_are_under_a_trunk_that_moves(path, feet, size):
                 assert np.allclose(place.rotation, home.rotations[0, foot], atol=1e-7)
 
 
+def test_links_have_room_where_the_robot_stands(task, motions):
+    (clearance,) = task.constraints
+    robot = with_moving_base(motions.robot)
+    for number in range(motions.phases):
+        still_phase = motions.phase(number, np.zeros(motions.shape))
+        q = still_phase.motion(motions.times).q
+        gaps = np.asarray(clearance.model.clearance(robot, q)).min(axis=0)
+        assert (gaps > 1.99 * clearance.distances).all()
+    assert clearance.distances.max() == pytest.approx(0.03)
+    assert 0.015 <= clearance.distances.min() < 0.03
+
+
 def test_the_zero_moment_point_follows_its_path(task):
     """The check is that of the forces, between the instants of the search, too."""
     motions = MotionsOnFeet(task.setup.base, task.family["standing"], 20, 0.8)
@@ -233,7 +246,8 @@ def test_files_say_which_feet_stand(task, designed, tmp_path):
 
 def test_ctrl_c_keeps_the_best_motion_and_begin_goes_on(task, designed):
     def stop(progress):
-        raise KeyboardInterrupt
+        if progress.feasible:
+            raise KeyboardInterrupt
 
     settings = {**task.family, "constraints": task.constraints}
     motion = designed.plan.trajectory

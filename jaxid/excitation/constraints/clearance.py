@@ -28,12 +28,12 @@ class Clearance(AbstractConstraint):
 
     Attributes:
         model: Shapes and pairs.
-        distance: Least distance between surfaces [m]; half of the largest one of two
-            bodies that are nearer in every pose.
+        distance: Least distance between surfaces, of all pairs or of each [m]; half of
+            the largest one of two bodies that are nearer in every pose.
     """
 
     model: CollisionModel
-    distance: float = 0.03
+    distance: float | Vector = 0.03
 
     @property
     def distances(self) -> Vector:
