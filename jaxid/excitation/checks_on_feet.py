@@ -24,10 +24,12 @@ class CheckedMotion(NamedTuple):
     Attributes:
         use: Used fraction of the ranges, speeds, accelerations, jerks [4 joints].
         findings: Other limited quantities.
+        joint_use: Largest use of a range, speed, acceleration or force [joints].
     """
 
     use: np.ndarray
     findings: list[Finding]
+    joint_use: np.ndarray
 
     @property
     def violation(self) -> float:
@@ -64,7 +66,9 @@ class ChecksOnFeet(NamedTuple):
         for constraint in self.constraints:
             excess = np.asarray(constraint(robot, motion)).max(axis=0)
             findings += constraint.describe(robot, excess)
-        return CheckedMotion(self._use(motion), findings)
+        use = self._use(motion)
+        joint_use = np.maximum(use.max(axis=0), self._force_use(forces)[GROUP:])
+        return CheckedMotion(use, findings, joint_use)
 
     def _use(self, motion: Motion) -> np.ndarray:
         """Return the used fractions of the limits of the joints."""
@@ -108,12 +112,19 @@ class ChecksOnFeet(NamedTuple):
             value=forces.friction.max() / friction - 1.0,
         )
 
+    def _force_use(self, forces: GroundForces) -> np.ndarray:
+        """Return the used fractions of the joints' forces; 0 without a limit."""
+        share = 1.0 - self.motions.standing.force_margin
+        max_forces = np.asarray(self.motions.robot.known_max_forces)
+        peaks = np.abs(forces.joint_forces).max(axis=0)
+        return np.where(np.isfinite(max_forces), peaks / (share * max_forces), 0.0)
+
     def _forces(self, forces: GroundForces) -> list[Finding]:
         """Return the forces of the joints whose limits are known."""
         robot = self.motions.robot
         share = 1.0 - self.motions.standing.force_margin
         max_forces = np.asarray(robot.known_max_forces)
-        peaks = np.abs(forces.joint_forces).max(axis=0)
+        force_use = self._force_use(forces)
         findings = []
         for joint in np.flatnonzero(np.isfinite(max_forces)).tolist():
             limit = share * max_forces[joint]
@@ -125,7 +136,7 @@ class ChecksOnFeet(NamedTuple):
                     robot.force_unit(joint),
                     limit,
                     note=note if share < 1.0 else "",
-                    value=peaks[joint] / limit - 1.0,
+                    value=force_use[joint] - 1.0,
                 )
             )
         return findings

@@ -38,9 +38,10 @@ NOISE_SHARE = 0.01
 GUARD = 0.5
 """Time around a change of contact whose samples are not counted on [s]."""
 SHRINKAGE = 0.5
-"""Factor by which half of the coordinates are made smaller until all limits are kept.
-"""
-MAX_SHRINKAGES = 12
+"""Factor by which coordinates are made smaller until all limits are kept."""
+ACCOMPANYING_SHARE = 0.2
+"""Share of these coordinates where joints of no leg exceed limits and shrink, too."""
+MAX_SHRINKAGES = 24
 """Times that they are; then the motion becomes one without waves."""
 MAX_NAMED = 3
 """Limits that are named if a robot cannot keep them."""
@@ -168,8 +169,6 @@ class DesignOnFeet:
     ) -> Candidate:
         """Return a phase that is made smaller until it keeps all limits at some times.
 
-        Which coordinates exceed a limit is not known: random ones are made smaller.
-
         Raises:
             InputError: If not even the lean and the lift alone keep them.
         """
@@ -183,13 +182,30 @@ class DesignOnFeet:
                 checked = self.checks(phase, times)
                 if checked.violation <= 0.0:
                     return Candidate(phase, self.information(phase))
-            is_smaller = random.uniform(size=(len(coefficients), 1)) < 0.5
+            is_smaller = self._smaller_coordinates(checked, random)
             coefficients = np.where(is_smaller, SHRINKAGE, 1.0) * coefficients
         raise InputError(
             f"`{self.motions.robot.name}` cannot move in phase {number + 1} of "
             f"{self.motions.phases} (all feet stand, then each is lifted in its turn), "
             f"however little it sways: {self._reason(checked)}."
         )
+
+    def _smaller_coordinates(
+        self, checked: CheckedMotion | None, random: np.random.Generator
+    ) -> np.ndarray:
+        """Return which coordinates are to become smaller.
+
+        Which ones exceed a limit is not known but for joints of no leg: random ones.
+        """
+        is_smaller = random.uniform(size=(self.motions.shape[0], 1)) < 0.5
+        if checked is None or not self.motions.other_joints:
+            return is_smaller
+        other_joints = np.array(self.motions.other_joints) - GROUP
+        exceeds = checked.joint_use[other_joints] > 1.0
+        if exceeds.any():
+            is_smaller &= random.uniform(size=is_smaller.shape) < ACCOMPANYING_SHARE
+            is_smaller[GROUP:-GROUP, 0] |= exceeds
+        return is_smaller
 
     def _reason(self, checked: CheckedMotion | None) -> str:
         """Return which limits a motion exceeds."""
