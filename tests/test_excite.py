@@ -247,7 +247,8 @@ def test_a_stopped_search_leaves_its_best_motion_and_another_goes_on(tmp_path, n
     assert files == ["motion.csv", "motion.json", "motion.ros.yaml"]
     if number is signal.SIGINT:
         assert process.returncode == 130
-        assert err.startswith(
+        # Busy machines print progress before it.
+        assert err.splitlines()[-1].startswith(
             "jaxid: stopped: `run/motion.csv` and the files beside it hold the"
         )
         assert "`--resume` continues from" in err
