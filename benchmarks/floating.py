@@ -680,7 +680,7 @@ def load_and_flags(study: Study, empty: jid.Fit, error: float) -> list[tuple]:
         (
             "a stance called swing: named; ratio of errors",
             "named",
-            f"{named[:1]}; {before:.1f}, checked {after:.2f}",
+            f"{len(named)} finding; {before:.1f}, checked {after:.2f}",
             bool(named),
         ),
     ]

@@ -79,11 +79,28 @@ class Mistake(NamedTuple):
         spoilt: Log with the mistake.
         words: Words of the finding that names it.
         cure: Columns that mend it, as the finding says.
+        places: Beginnings of the names of joints, legs and feet that it must name.
     """
 
     spoilt: Callable[[Log], Log]
     words: tuple[str, ...]
     cure: Callable[[str], dict[str, Any]]
+    places: Callable[[jid.Robot], list[str]] = lambda robot: []
+
+
+def joints_named(*joints: int) -> Callable[[jid.Robot], list[str]]:
+    """Return the names of some of twelve joints, as a finding writes them."""
+    return lambda robot: [f"`{robot.joint_names[6 + joint]}`" for joint in joints]
+
+
+def legs_named(*joints: int) -> Callable[[jid.Robot], list[str]]:
+    """Return the two letters with which all names of a joint's leg begin."""
+    return lambda robot: [f"`{robot.joint_names[6 + joint][:2]}" for joint in joints]
+
+
+def feet_named(*feet: int) -> Callable[[jid.Robot], list[str]]:
+    """Return the names of feet."""
+    return lambda robot: [f"`{robot.contacts[foot].name}`" for foot in feet]
 
 
 def factors(joint: int, factor: float) -> np.ndarray:
@@ -99,6 +116,7 @@ def wrong_signs(joint: int, *channels: str) -> Mistake:
         lambda log: log | {channel: log[channel] * signs for channel in channels},
         tuple(keys[channel] for channel in channels),
         lambda text: {keys[channel]: tuple(signs) for channel in channels},
+        joints_named(joint),
     )
 
 
@@ -113,10 +131,13 @@ def wrong_scale(joint: int, factor: float) -> Mistake:
         lambda log: log | {"forces": log["forces"] * factors(joint, factor)},
         ("force_gains",),
         cure,
+        joints_named(joint),
     )
 
 
-def exchanged(order: list[int], *channels: str) -> Mistake:
+def exchanged(
+    order: list[int], places: Callable[[jid.Robot], list[str]], *channels: str
+) -> Mistake:
     """Return columns in another order, which is its own inverse."""
 
     def cure(text: str) -> dict[str, Any]:
@@ -129,6 +150,7 @@ def exchanged(order: list[int], *channels: str) -> Mistake:
         lambda log: log | {channel: log[channel][:, order] for channel in channels},
         ("exchanged", f"`recording.{channels[0]}`"),
         cure,
+        places,
     )
 
 
@@ -145,13 +167,19 @@ MISTAKES = {
     "torque of a knee: in mNm": wrong_scale(5, 1000.0),
     "torque of a hip: gear of 9 missing": wrong_scale(6, 1 / 9),
     "torque of a thigh: 20 % too small": wrong_scale(1, 0.8),
-    "torques of a leg's thigh and knee exchanged": exchanged(pair(1, 2), "forces"),
-    "torques of two thighs exchanged": exchanged(pair(4, 10), "forces"),
-    "legs exchanged: torques": exchanged(LEGS_EXCHANGED, "forces"),
-    "legs exchanged: angles": exchanged(LEGS_EXCHANGED, "angles"),
-    "legs exchanged: both": exchanged(LEGS_EXCHANGED, "angles", "forces"),
+    "torques of a leg's thigh and knee exchanged": exchanged(
+        pair(1, 2), joints_named(1, 2), "forces"
+    ),
+    "torques of two thighs exchanged": exchanged(
+        pair(4, 10), joints_named(4, 10), "forces"
+    ),
+    "legs exchanged: torques": exchanged(LEGS_EXCHANGED, legs_named(0, 3), "forces"),
+    "legs exchanged: angles": exchanged(LEGS_EXCHANGED, legs_named(0, 3), "angles"),
+    "legs exchanged: both": exchanged(
+        LEGS_EXCHANGED, legs_named(0, 3), "angles", "forces"
+    ),
     "diagonal legs exchanged: both": exchanged(
-        DIAGONAL_LEGS_EXCHANGED, "angles", "forces"
+        DIAGONAL_LEGS_EXCHANGED, legs_named(0, 9), "angles", "forces"
     ),
     "encoder of a hip: sign": wrong_signs(0, "angles"),
     "encoder of a knee: sign": wrong_signs(11, "angles"),
@@ -161,8 +189,10 @@ MISTAKES = {
         ("contact_inverted",),
         lambda text: {"contact_inverted": True},
     ),
-    "flags of two feet exchanged": exchanged([1, 0, 2, 3], "contact"),
-    "flags of left and right exchanged": exchanged([1, 0, 3, 2], "contact"),
+    "flags of two feet exchanged": exchanged([1, 0, 2, 3], feet_named(0, 1), "contact"),
+    "flags of left and right exchanged": exchanged(
+        [1, 0, 3, 2], feet_named(0, 1, 2, 3), "contact"
+    ),
 }
 
 
@@ -200,7 +230,8 @@ def verdict(study: Study, log: Log, mistake: Mistake, clean_error: float) -> str
     ratio = spoilt.error / clean_error
     text = spoilt.texts[0] if spoilt.texts else ""
     print(f"    {text}", flush=True)
-    is_named = all(words in text for words in mistake.words)
+    places = mistake.places(study.base.model.robot)
+    is_named = all(words in text for words in (*mistake.words, *places))
     if not is_named or spoilt.count != 1 or len(spoilt.texts) > 1:
         return f"{ratio:.1f} times the error, NOT NAMED ({len(spoilt.texts)} findings)"
     mended = examined(study, spoilt_log, **mistake.cure(text))
@@ -230,9 +261,12 @@ if __name__ == "__main__":
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--robot", choices=ROBOTS, help="all if left out")
     parser.add_argument("--mistake", choices=MISTAKES, help="all if left out")
+    parser.add_argument("--quick", action="store_true", help="one mistake of a Go2")
     parser.add_argument("--json")
     options = parser.parse_args()
     names = [options.robot] if options.robot else [*ROBOTS]
     mistakes = [options.mistake] if options.mistake else [*MISTAKES]
+    if options.quick:
+        names, mistakes = names[:1], mistakes[:1]
     rows = [row for name in names for row in rows_of(name, mistakes, 40.0)]
     hand_over(rows, options.json)

@@ -79,6 +79,7 @@ METHODS = (
     Script("force_sensor", 10),
     Script("floating", 10),
     Script("designed_legs", 12),
+    Script("leg_mistakes", 40),
     Script("transients", 1),
     Script("excitation", 60),
     Script("safe_motions", 40),
